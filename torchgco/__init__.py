@@ -35,7 +35,7 @@ from torchgco.base.errors import (
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold, IteratedMPPI
-from torchgco.compiled import MPC, Answer, Compiled, MPPIController, compile
+from torchgco.compiled import MPC, Answer, Compiled, FleetMPC, MPPIController, compile
 from torchgco.constraints import (
     Cone,
     Constraint,
@@ -63,9 +63,9 @@ from torchgco.dynamics import (
 )
 from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
+from torchgco.fleets.judging import judge
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
-from torchgco.judging.judge import judge
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres
@@ -95,7 +95,7 @@ __all__ = [  # noqa: RUF022
     # solving it
     "solve", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
-    "Fleet", "FleetSolution",
+    "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result

@@ -396,23 +396,30 @@ def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | 
 def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
     from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
 
-    if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
-        raise InputError("solution", "a fleet and its solution", type(solution).__name__)
+    _fleet_of(fleet, solution)
     arrays = [[tensor.detach().cpu().double().numpy() for tensor in (member.X, member.U)] for member in solution]
     X, U = zip(*arrays, strict=True)
     return fleet_figure(fleet.members, X, U, fleet.distances.cpu().double().numpy(), b)
 
 
-def show(problem: Problem, solution: Solution) -> HtmlPage:
+def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[Solution]]:
+    if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
+        raise InputError("solution", "a fleet and its solution", type(solution).__name__)
+    return fleet.members, solution.vehicles
+
+
+def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPage:
     """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
+
+    Of fleets with a colour for each vehicle.
 
     Raises:
         InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
     """
     from torchgco.view import notebook  # slow to load
 
-    if isinstance(problem, Fleet):
-        raise InputError("problem", "a Problem, such as fleet.members[0] with solution[0]", "Fleet")
+    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
+        return notebook.show_fleet(*_fleet_of(problem, solution))
     return notebook.show(problem, solution.detach())
 
 

@@ -12,14 +12,16 @@ from torch import Tensor
 
 import torchgco
 from tests.fleets.scenes import DISC, DT, D, disc, pushed, ring, swaps
+from tests.view.test_packing import part
 from torchgco import Boxes, Fleet, FreeTime, FunctionDynamics, InputError, Moved, Problem, Spheres, judge
+from torchgco.fleets.among import Among
 from torchgco.fleets.fleet import _forms
 from torchgco.fleets.guesses import bent, in_conflict, late, widths
-from torchgco.fleets.joint import Halfway, VehicleRows, joint_problem
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.prioritised import Prioritised
 from torchgco.fleets.solve import alone
 from torchgco.fleets.verdict import judge_fleet
+from torchgco.problem.known import Known
 
 
 def dense(U: Tensor, x0: Tensor, dt: float, steps: int = 40) -> np.ndarray:
@@ -83,26 +85,40 @@ def test_results_do_not_depend_on_the_other_fleets_of_a_batch() -> None:
 def test_who_is_in_nobodys_way_flies_as_if_alone() -> None:
     fleet = Fleet([disc([0, 3.0 * v], [3, 3.0 * v]) for v in range(3)], apart=0.4)
     found = torchgco.solve(fleet)
+    assert torch.equal(torchgco.judge(fleet, found).cost, found.cost)
     for v, (one, member) in enumerate(zip(found, fleet.members, strict=True)):
         assert torch.equal(one.U, torchgco.solve(member, ids=torch.tensor([v])).U)
     assert bool(found.sound.all()) and float(found.least_distance[0]) == pytest.approx(3.0, abs=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")  # of guesses, which is repaired
 def test_prioritised_planning_alone() -> None:
-    """Larger fleets aren't one problem: each vehicle plans among the motions of those before it."""
-    fleet = Fleet(swaps(5, 2), apart=0.4)
-    first = alone(fleet, torchgco.solve, 0, torch.arange(2), "gco")
+    """Each vehicle plans among the motions of those before it; teams don't depend on each other."""
+    fleet, both = Fleet(swaps(5, 2), apart=0.4), torch.arange(2)
+    first = alone(fleet, torchgco.solve, 0, both, "gco")
     assert not bool(judge_fleet(fleet, first.U).feasible.any())
-    plans = Prioritised(fleet, first, torchgco.solve, 0, torch.arange(2), "gco").run()
+    orders = [[4, 2, 0, 1, 3], [0, 1, 2, 3, 4]]
+    plans = Prioritised(fleet, forms_of(fleet), both, first, orders).run()
     verdict = judge_fleet(fleet, plans.U)
     assert bool(verdict.reached.all())
     for b in range(2):
-        assert nearest(fleet, plans.solutions(fleet), b) >= 0.95 * 0.4 - 1e-3
+        ways = [Bare(u[[b]]) for u in plans.U]
+        assert nearest(fleet.take([b]), ways) >= 0.95 * 0.4 - 1e-3
     second = torch.tensor([1])
-    one = Fleet([member.take(second) for member in fleet.members], 0.4)
-    again = Prioritised(one, first.take(second), torchgco.solve, 0, second, "gco").run()
+    again = Prioritised(fleet, forms_of(fleet), second, first.take(second), orders[1:]).run()
     assert all(torch.equal(mine[0], yours[1]) for mine, yours in zip(again.U, plans.U, strict=True))
+    late = Prioritised(fleet, forms_of(fleet), both, first, orders, lambda: True).run()
+    assert all(torch.equal(mine, yours) for mine, yours in zip(late.U, first.U, strict=True))
+
+
+def forms_of(fleet: Fleet) -> list[Among]:
+    return [Among(problem, Known()) for problem, _ in fleet.forms]
+
+
+class Bare:
+    """Controls alone."""
+
+    def __init__(self, U: Tensor) -> None:
+        self.U = U
 
 
 def test_different_vehicles_distances_and_obstacles() -> None:
@@ -138,45 +154,11 @@ def test_two_that_pass_between_the_knots_are_seen() -> None:
     X = [torch.cat((one.x0[:, :2], speeds[[v]]), -1) for v, one in enumerate(fleet.members)]
     moving = Fleet([replace(one, x0=x) for one, x in zip(fleet.members, X, strict=True)], apart=0.2)
     still = [torch.zeros(1, 50, 2, dtype=D)] * 2
-    verdict = judge_fleet(moving, still)
+    verdict = judge(moving, still)
     at_knots = min(abs(-2.45 + 0.24 * k - (2.55 - 0.24 * k)) for k in range(51))
     assert at_knots > 0.039 and float(verdict.least_distance[0]) < 1e-9
     assert float(verdict.clearance[0]) == pytest.approx(-0.19, abs=1e-9) and not bool(verdict.feasible[0])
-
-
-def test_the_joint_problem_is_that_of_all_vehicles() -> None:
-    """Steps, costs and rows are the vehicles' own; derivatives are those of autodiff."""
-    rng = np.random.default_rng(0)
-    fleet = Fleet([*swaps(2, 2), *swaps(3, 2)[2:]], apart=[0.4, 0.5, 0.6])
-    problem = joint_problem(fleet, True)
-    assert problem is not None and problem.n == 12 and problem.m == 6
-    X, U = (torch.from_numpy(rng.normal(size=(2, k, n))) for k, n in ((51, 12), (50, 6)))
-    own = [(X[..., 4 * v : 4 * v + 4], U[..., 2 * v : 2 * v + 2]) for v in range(3)]
-    costs = [one.cost.total(x, u) for one, (x, u) in zip(fleet.members, own, strict=True)]
-    torch.testing.assert_close(problem.cost.total(X, U), sum(costs))
-    steps = [one.dynamics.step(x[:, :-1], u) for one, (x, u) in zip(fleet.members, own, strict=True)]
-    torch.testing.assert_close(problem.dynamics.step(X[:, :-1], U), torch.cat(steps, -1))
-    worst = torch.stack([part.worst(X, U) for part in problem.constraints if not isinstance(part, Halfway)]).amax(0)
-    theirs = [part.worst(x, u) for one, (x, u) in zip(fleet.members, own, strict=True) for part in one.constraints]
-    p = torch.stack([x[..., :2] for x, _ in own], 1)
-    for (i, j), keep in zip(((0, 1), (0, 2), (1, 2)), (0.4, 0.5, 0.6), strict=True):
-        theirs.append((keep - (p[:, i] - p[:, j])[:, 1:].norm(dim=-1)).clamp(min=0).amax(-1))
-        middle = [x[:, :-1, :2] + 0.05 * x[:, :-1, 2:] + 0.5 * 0.05**2 * u for x, u in own]
-        halfway = (keep - (middle[i] - middle[j]).norm(dim=-1)).clamp(min=0)
-        row = [(0, 1), (0, 2), (1, 2)].index((i, j))
-        torch.testing.assert_close(problem.constraints[-1].violation(X, U)[..., row], halfway)
-    torch.testing.assert_close(worst, torch.stack(theirs).amax(0))
-    for part in (problem.constraints[-1], *(one for one in problem.constraints if isinstance(one, VehicleRows))):
-        _check_derivatives(part, X, U)
-
-
-def _check_derivatives(part: Any, X: Tensor, U: Tensor) -> None:
-    g = torch.rand(part.value(X, U).shape, dtype=D, generator=torch.Generator().manual_seed(0))
-    H = X.new_zeros(2, 51, 19, 19)
-    part.accumulate(X, U, g, torch.zeros_like(g), H)
-    by_x, by_u = torch.func.grad(lambda X, U: (g * part.value(X, U)).sum(), argnums=(0, 1))(X, U)
-    torch.testing.assert_close(H[:, :, :12, 12], by_x)
-    torch.testing.assert_close(H[:, :-1, 13:, 12], by_u)
+    assert verdict.apart.tolist() == [[False, False]] and all(bool(one.feasible[0]) for one in verdict.vehicles)
 
 
 def test_guesses_bend_to_one_side_and_wait() -> None:
@@ -201,8 +183,8 @@ def test_problems_of_one_form_are_one_batch() -> None:
     assert whose == (0, 1, 2) and batch.B == 3
     X, U = torch.randn(3, 51, 4, dtype=D), torch.randn(3, 50, 2, dtype=D)
     for v, one in enumerate(members):
-        for part, own in zip(batch.constraints, one.constraints, strict=True):
-            torch.testing.assert_close(part.value(X, U)[v], own.value(X[[v]], U[[v]])[0])
+        for row, own in zip(batch.constraints, one.constraints, strict=True):
+            torch.testing.assert_close(row.value(X, U)[v], own.value(X[[v]], U[[v]])[0])
         torch.testing.assert_close(batch.cost.total(X, U)[v], one.cost.total(X[[v]], U[[v]])[0])
     other = disc([-2, 0], [2, 0], model=FunctionDynamics(lambda x, u: pushed(x, u), 4, 2, DT, "rk4", slice(0, 2)))
     assert len(_forms((members[0], other))) == 2
@@ -212,15 +194,21 @@ def test_time_is_kept() -> None:
     fleet = Fleet(swaps(4), apart=0.4)
     found = torchgco.solve(fleet, max_seconds=1e-3)
     assert not bool(found.sound.any()) and bool(torch.isfinite(found.cost).all())
+    assert {status.name for one in found for status in one.statuses} <= {"TIME_LIMIT", "FEASIBLE"}
 
 
 def test_a_figure_has_a_colour_for_each_vehicle() -> None:
     fleet = Fleet(swaps(3), apart=0.4)
     plans = Plans.at_rest(fleet)
-    found = torchgco.fleets.FleetSolution(fleet, plans.solutions(fleet), judge_fleet(fleet, plans.U))
+    verdict = judge_fleet(fleet, plans.U)
+    found = torchgco.fleets.FleetSolution(fleet, plans.solutions(fleet, verdict), verdict)
     figure = torchgco.plot(fleet, found)
     colours = {line.get_color() for ax in figure.axes for line in ax.lines if len(line.get_xdata()) > 2}  # type: ignore[arg-type]
     assert len(colours) >= 3
+    html = torchgco.show(fleet, found).html
+    head, first = part(html, "head"), part(html, "part-0")
+    assert [one["name"] for one in head["solvers"]] == ["vehicle 0", "vehicle 1", "vehicle 2"]
+    assert len({one["colour"] for one in head["solvers"]}) == 3 and len(first["flights"]) == 3
     with pytest.raises(InputError, match="b: expected the place of a fleet, 0 to 0"):
         torchgco.plot(fleet, found, 1)
 
@@ -239,6 +227,7 @@ BAD: dict[str, tuple[Any, Any, str]] = {
     "apart": ([FIRST, one_of()], {"apart": -0.4}, "fleet.apart: expected finite distances above 0 m"),
     "shape": ([FIRST, one_of()], {"apart": [0.4, 0.4]}, "fleet.apart: expected a number, or one for each of 1 pairs"),
     "pairs": ([FIRST, one_of()], {"pairs": [(0, 2)]}, r"fleet.pairs: expected pairs of two vehicles within 0..1"),
+    "none": ([FIRST, one_of()], {"pairs": []}, "fleet.pairs: expected pairs of two vehicles within 0..1"),
     "twice": ([FIRST, one_of()], {"pairs": [(0, 1), (1, 0)]}, "fleet.pairs: expected .* none twice"),
     "starts": ([FIRST, disc([0.2, 0.0], [3, 0])], {}, "expected starts 0.4 m apart, got vehicles 0 and 1 of fleet 0"),
     "single": ([FIRST, one_of().cast(torch.float32)], {}, r"vehicles\[1\].x0: expected float64 on the CPU"),
@@ -255,7 +244,14 @@ def test_what_is_wrong_with_a_fleet_is_named(case: str) -> None:
 
 def test_arguments_that_fleets_do_not_take_are_named() -> None:
     fleet = Fleet(swaps(2), 0.4)
+    for U, more, message in (
+        (torch.zeros(1, 50, 2), {}, r"U: expected a FleetSolution, or controls \(B, N, m\) of each of 2 vehicles"),
+        ([torch.zeros(1, 50, 2)], {}, "U: expected a FleetSolution"),
+        ([torch.zeros(1, 50, 2)] * 2, {"goal_radius": 0.3}, "judge.goal_radius: expected None of a fleet"),
+    ):
+        with pytest.raises(InputError, match=message):
+            torchgco.judge(fleet, U, **more)  # type: ignore[call-overload]
     with pytest.raises(InputError, match=r"solve.U0: expected None of a fleet"):
         torchgco.solve(fleet, U0=torch.zeros(1, 50, 2))  # type: ignore[call-overload]
-    with pytest.raises(InputError, match=r"a Problem, such as fleet.members\[0\]"):
+    with pytest.raises(InputError, match="solution: expected a fleet and its solution, got NoneType"):
         torchgco.show(fleet, None)  # type: ignore[arg-type]

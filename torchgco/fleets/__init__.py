@@ -1,8 +1,9 @@
 """Fleets: vehicles that move at the same time and keep apart.
 
-`fleet.Fleet` says what one is. `solve.solve_fleet` plans each vehicle alone, then all together as one problem
-(`joint`, `together`), and one after the other among each other's motions (`prioritised`) where that doesn't do; what
-`verdict.judge_fleet` finds best is the `FleetSolution`. Begin with `solve.py`.
+`fleet.Fleet` says what one is. `solve.solve_fleet` plans each vehicle alone. Where that doesn't do, all pass each other
+on one side (`guesses`), come apart (`coming_apart`) and share the room at the least cost of all (`shared_room`), both
+by the forces between them (`forces`); or they plan one after the other (`prioritised`). What `verdict.judge_fleet`
+finds best is the `FleetSolution`. Begin with `solve.py`.
 """
 
 from torchgco.fleets.fleet import Fleet as Fleet

@@ -85,15 +85,22 @@ class Fleet:
         """States of all vehicles together."""
         return sum(one.n for one in self.members)
 
+    @property
+    def pairs_kept(self) -> tuple[Tensor, Tensor]:
+        """Both vehicles of the Q pairs that keep a distance, the first below the second, (Q,) each."""
+        first, second = self.distances.triu().nonzero(as_tuple=True)
+        return first, second
+
     def places(self, X: Sequence[Tensor]) -> Tensor:
         """Positions (B, V, K, d) of the vehicles in states (B, K, n) each."""
         return torch.stack([x[..., one.position] for one, x in zip(self.members, X, strict=True)], dim=1)
 
     def take(self, b: Sequence[int]) -> Fleet:
         """The fleets at some places of the batch."""
-        members = tuple(one.take(torch.tensor(list(b))) for one in self.members)
-        one = object.__new__(Fleet)
-        forms = _forms(members) if not self.is_batch else self.forms
+        rows, one = torch.tensor(list(b)), object.__new__(Fleet)
+        members = tuple(each.take(rows) for each in self.members)
+        at = [torch.cat([place * self.B + rows for place in range(len(whose))]) for _, whose in self.forms]
+        forms = tuple((batch.take(own), whose) for (batch, whose), own in zip(self.forms, at, strict=True))
         kept = {"vehicles": members, "apart": self.apart, "pairs": self.pairs, "members": members, "forms": forms}
         for name, part in (kept | {"distances": self.distances}).items():
             object.__setattr__(one, name, part)
@@ -148,7 +155,7 @@ def _pairs(pairs: Any, V: int) -> list[tuple[int, int]]:
     except TypeError:
         raise InputError("fleet.pairs", expected, shown(pairs)) from None
     fits = all(len(pair) == 2 and 0 <= pair[0] < pair[1] < V for pair in found)
-    if not fits or len(set(found)) < len(found):
+    if not found or not fits or len(set(found)) < len(found):
         raise InputError("fleet.pairs", expected, shown(pairs))
     return [(pair[0], pair[1]) for pair in found]
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.verdict import FleetVerdict
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
@@ -49,13 +50,28 @@ class Plans:
                 part[rows] = new
         self.status[rows], self.iterations[rows] = other.status, other.iterations
 
+    def put_one(self, v: int, rows: Tensor, other: Plans) -> None:
+        """Those of one vehicle in other fleets in the place of some."""
+        for mine, theirs in ((self.X, other.X), (self.U, other.U), (self.K, other.K)):
+            mine[v][rows] = theirs[v]
+        self.status[rows, v] = other.status[:, v]
+
     def set(self, v: int, rows: Tensor, found: Solution, of: Tensor) -> None:
         """Vehicle v of some fleets: the trajectories at places `of` of a solution."""
         self.X[v][rows], self.U[v][rows], self.K[v][rows] = found.X[of], found.U[of], found.K[of]
         self.status[rows, v] = found.status[of]
 
-    def solutions(self, fleet: Fleet) -> tuple[Solution, ...]:
-        """A solution per vehicle, without multipliers."""
+    def solutions(self, fleet: Fleet, verdict: FleetVerdict, late: bool = False) -> tuple[Solution, ...]:
+        """A solution per vehicle, without multipliers; each status says whether constraints and distances are kept.
+
+        Args:
+            late: whether time has ended the solve.
+        """
+        good = torch.stack([one.feasible for one in verdict.vehicles], dim=1) & verdict.apart
+        claims = torch.isin(self.status, torch.tensor([Status.CONVERGED, Status.FEASIBLE]))
+        self.status = torch.where(good & ~claims & (not late), int(Status.FEASIBLE), self.status)
+        lost = Status.TIME_LIMIT if late else Status.INFEASIBLE
+        self.status = torch.where(~good & claims, int(lost), self.status)
         return tuple(self._solution(v, one) for v, one in enumerate(fleet.members))
 
     def _solution(self, v: int, one: Problem) -> Solution:

@@ -1,149 +1,163 @@
 """Prioritised planning: one vehicle after the other, each among the planned motions of those before it.
 
-M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987). Vehicles that find no plan move to
-the front, and their fleet begins again.
+M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987). Several orders are planned side by
+side. Vehicles that find no plan move to the front, and their team begins again.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED
+from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, bent, in_conflict, late, widths
-from torchgco.fleets.plans import Plans, Solve
+from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
 from torchgco.judging.judge import judge
-from torchgco.obstacles.moved import Moved
-from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
-from torchgco.solution import Solution
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.roadmap.timed import library_for
+from torchgco.search.timed import ways_in_time
+from torchgco.search.timed_guesses import guesses_along
+from torchgco.search.timed_scenes import can_search
 
-RESTARTS = 3  # of each fleet
+RESTARTS = 3  # of each team
 DELAYS = 0.1, 0.2, 0.4  # of beginning, shares of all stages
+WAYS = 4  # through space and time, of those that no guess serves
 REPAIRS = 3  # solves among larger others of what touches them between the knots
 BEYOND, MORE = 1.5, 2e-3  # by how much more than it touches they are larger: times, and m
-# From near guesses: a large barrier would lose them.
-SOLVER = InteriorPoint(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
-
-
-@dataclass(frozen=True)
-class Among:
-    """The vehicles of a form among others: problems that share what is known of them."""
-
-    problem: Problem
-    known: Known
-
-    def at(self, rows: Tensor, places: Tensor, radii: Tensor) -> Problem:
-        """The problems at some rows, among motions (b, N+1, M, d) that they keep radii (b, M) from."""
-        one = self.problem.take(rows)
-        others = Moved(places, radii).bind(one._dimensions(one.x0))
-        own = [part for part in one.constraints if not part.is_goal]
-        goals = [part for part in one.constraints if part.is_goal]
-        return one._with({"constraints": (*own, others, *goals)}, known=self.known)
 
 
 class Prioritised:
-    """Planning of all fleets of a batch side by side; their vehicles have turns of their own."""
+    """Planning of C teams side by side; their vehicles have turns of their own.
 
-    def __init__(self, fleet: Fleet, alone: Plans, solve: Solve, seed: int, ids: Tensor, solver: Any) -> None:
-        B, V = fleet.B, fleet.V
-        self.fleet, self.alone, self.ids = fleet, alone, ids
-        self.solve, self.search = solve, partial(solve, seed=seed, solver=solver)
-        self.forms = [Among(problem, Known()) for problem, _ in fleet.forms]
+    Args:
+        fleet: of which these are.
+        forms: of its vehicles.
+        of: which of the fleets each team is, (C,).
+        alone: what its vehicles do without the others.
+        orders: in which its vehicles plan, of each team.
+        late: whether the time is over.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        forms: Sequence[Among],
+        of: Tensor,
+        alone: Plans,
+        orders: Sequence[Sequence[int]],
+        late: Callable[[], bool] = lambda: False,
+    ) -> None:
+        C, V = len(of), fleet.V
+        self.fleet, self.forms, self.of, self.alone, self.late = fleet, forms, of, alone, late
         self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
-        self.order = [np.random.default_rng((seed, int(i))).permutation(V).tolist() for i in ids]
-        self.at, self.restarts = [0] * B, [0] * B
-        self.plans = alone.take(torch.arange(B))
-        self.known = torch.zeros(B, V, dtype=torch.bool)
-        self.off = alone.X[0].new_zeros(B, V)  # by which paths leave the chords that others know, m
+        self.order = [list(order) for order in orders]
+        self.at, self.restarts = [0] * C, [0] * C
+        self.plans = alone.take(torch.arange(C))
+        self.known = torch.zeros(C, V, dtype=torch.bool)
+        self.off = alone.X[0].new_zeros(C, V)  # by which paths leave the chords that others know, m
         self.wide = widths(fleet, in_conflict(fleet, alone))
 
     def run(self) -> Plans:
-        """Plans of all fleets; vehicles without one are where they would be alone."""
-        while rows := [b for b in range(self.fleet.B) if self.at[b] < self.fleet.V]:
-            turn = {b: self.order[b][self.at[b]] for b in rows}
+        """Plans of all teams; vehicles without one are where they would be alone."""
+        while rows := [c for c in range(len(self.of)) if self.at[c] < self.fleet.V]:
+            if self.late():
+                break
+            turn = {c: self.order[c][self.at[c]] for c in rows}
             for i in range(len(self.forms)):
-                mine = [b for b in rows if self.form_of[turn[b]][0] == i]
+                mine = [c for c in rows if self.form_of[turn[c]][0] == i]
                 if mine:
-                    self._step(i, torch.tensor(mine), torch.tensor([turn[b] for b in mine]))
+                    self._step(i, torch.tensor(mine), torch.tensor([turn[c] for c in mine]))
         return self.plans
 
-    def _step(self, form: int, fleets: Tensor, vehicles: Tensor) -> None:
-        """Plan a vehicle of each of some fleets, all of one form."""
-        found = self._planned(form, fleets, vehicles)
-        for b, v, ok in zip(fleets.tolist(), vehicles.tolist(), found.tolist(), strict=True):
-            if ok or self.restarts[b] >= RESTARTS:
-                self.known[b, v], self.at[b] = True, self.at[b] + 1
-                row, one = torch.tensor([b]), self.fleet.members[v]
-                self.off[b, v] = leaves_chords(one.take(row), self.plans.X[v][row], self.plans.U[v][row])[0]
+    def _step(self, form: int, teams: Tensor, vehicles: Tensor) -> None:
+        """Plan a vehicle of each of some teams, all of one form."""
+        turn = _Turn(self, form, teams, vehicles)
+        turn.plan()
+        for c, v, found in zip(teams.tolist(), vehicles.tolist(), turn.found.tolist(), strict=True):
+            if found or self.restarts[c] >= RESTARTS:
+                self.known[c, v], self.at[c] = True, self.at[c] + 1
+                row, one = torch.tensor([c]), self.fleet.members[v]
+                self.off[c, v] = leaves_chords(one.take(self.of[row]), self.plans.X[v][row], self.plans.U[v][row])[0]
                 continue
-            self.restarts[b] += 1
-            self.order[b].remove(v)
-            self.order[b].insert(0, v)
-            self.known[b], self.at[b] = False, 0
+            self.restarts[c] += 1
+            self.order[c].remove(v)
+            self.order[c].insert(0, v)
+            self.known[c], self.at[c] = False, 0
 
-    def _planned(self, form: int, fleets: Tensor, vehicles: Tensor) -> Tensor:
-        """Which found a plan; from guesses near those alone, and by a search where these don't do."""
-        rows = torch.tensor([self.form_of[v][1] for v in vehicles.tolist()]) * self.fleet.B + fleets
-        p = self.fleet.places(self.plans.X)[fleets].transpose(1, 2)  # (b, N+1, V, d)
-        radii = self.fleet.distances[vehicles]
-        there = self.known[fleets] & (radii > 0)
-        there[torch.arange(len(fleets)), vehicles] = False
-        radii = radii + self.off[fleets]
-        p, radii = torch.where(there[:, None, :, None], p, torch.nan), torch.where(there, radii, torch.nan)
-        among = self.forms[form]
-        found = self._near(among, rows, p, radii, fleets, vehicles)
-        left = (~found).nonzero().flatten()
-        if len(left):
-            problem = among.at(rows[left], p[left], radii[left])
-            ids = self.ids[fleets[left]] * self.fleet.V + vehicles[left]
-            solution = self.search(problem, ids=ids)
-            fine = arrives(problem, solution.U)[0]
-            for place, i in enumerate(left.tolist()):
-                self._keep(fleets[i], vehicles[i], solution, place)
-            found[left] = fine
-        return found
 
-    def _near(self, among: Among, rows: Tensor, p: Tensor, radii: Tensor, fleets: Tensor, vehicles: Tensor) -> Tensor:
-        """The cheapest plans from guesses near those alone; which of the vehicles have one."""
-        pairs = list(zip(fleets.tolist(), vehicles.tolist(), strict=True))
-        X, U = (torch.stack([part[v][b] for b, v in pairs]) for part in (self.alone.X, self.alone.U))
-        wide, position = self.wide[fleets, vehicles], among.problem.position
-        guesses = [(X, U)] + [(bent(X, position, side, wide), U) for side in SIDES]
-        guesses += [late(X, U, round(share * U.shape[1])) for share in DELAYS]
-        count, b = len(guesses), len(rows)
-        every = torch.arange(b).repeat(count)
+class _Turn:
+    """Vehicles (b,) of as many teams, all of one form, that plan among those that have planned."""
+
+    def __init__(self, run: Prioritised, form: int, teams: Tensor, vehicles: Tensor) -> None:
+        self.run, self.among, self.teams, self.vehicles = run, run.forms[form], teams, vehicles
+        places = torch.tensor([run.form_of[v][1] for v in vehicles.tolist()])
+        self.rows = places * run.fleet.B + run.of[teams]
+        radii = run.fleet.distances[vehicles]
+        there = run.known[teams] & (radii > 0)
+        there[torch.arange(len(teams)), vehicles] = False
+        p = run.fleet.places(run.plans.X)[teams].transpose(1, 2)  # (b, N+1, V, d)
+        self.p = torch.where(there[:, None, :, None], p, torch.nan)
+        self.radii = torch.where(there, radii + run.off[teams], torch.nan)
+        self.own = 0.5 * torch.where(radii > 0, radii, torch.inf).amin(-1)
+        pairs = list(zip(teams.tolist(), vehicles.tolist(), strict=True))
+        self.X, self.U = (torch.stack([part[v][c] for c, v in pairs]) for part in (run.alone.X, run.alone.U))
+        self.cost = torch.full((len(teams),), torch.inf, dtype=radii.dtype)
+
+    @property
+    def found(self) -> Tensor:
+        """Which have a plan, (b,)."""
+        return torch.isfinite(self.cost)
+
+    def plan(self) -> None:
+        """From guesses near those alone, and along ways through space and time where these don't do."""
+        wide, position = self.run.wide[self.teams, self.vehicles], self.among.problem.position
+        guesses = [(self.X, self.U)] + [(bent(self.X, position, side, wide), self.U) for side in SIDES]
+        guesses += [late(self.X, self.U, round(share * self.U.shape[1])) for share in DELAYS]
         X0, U0 = (torch.cat(parts) for parts in zip(*guesses, strict=True))
-        grown, best = torch.zeros(len(every), dtype=X.dtype), torch.full((b,), torch.inf, dtype=X.dtype)
-        left = torch.arange(len(every))
+        self._solve(torch.arange(len(self.rows)).repeat(len(guesses)), X0, U0)
+        left = (~self.found).nonzero().flatten()
+        if len(left) == 0 or self.run.late():
+            return
+        problem = self._problem(left)
+        if not self._can_search(problem):
+            return
+        ways = ways_in_time(problem, self.X[left], WAYS)
+        each = torch.tensor([b for b, some in enumerate(ways) for _ in some.points], dtype=torch.int64)
+        if len(each):
+            X0, U0 = guesses_along(problem, each, ways)
+            self._solve(left[each], X0, U0)
+
+    def _can_search(self, problem: Problem) -> bool:
+        return can_search(problem) and library_for(problem.position.stop - problem.position.start) is not None
+
+    def _problem(self, rows: Tensor, grown: Tensor | float = 0.0) -> Problem:
+        radii = self.radii[rows] + (grown.unsqueeze(-1) if isinstance(grown, Tensor) else grown)
+        return self.among.at(self.rows[rows], self.p[rows], radii, own=self.own[rows])
+
+    def _solve(self, whose: Tensor, X0: Tensor, U0: Tensor) -> None:
+        """Keep the cheapest of what guesses (C, ...) of vehicles `whose` (C,) lead to."""
+        grown, left = torch.zeros(len(whose), dtype=X0.dtype), torch.arange(len(whose))
         for _ in range(1 + REPAIRS):
-            own = every[left]
-            larger = among.at(rows[own], p[own], radii[own] + grown[left].unsqueeze(-1))
-            solution = self.solve(larger, solver=SOLVER, X0=X0[left], U0=U0[left])
-            fine, cost, touch = arrives(among.at(rows[own], p[own], radii[own]), solution.U)
+            own = whose[left]
+            solution = SOLVER.solve(self._problem(own, grown[left]), U0[left], X0=X0[left])
+            fine, cost, touch = arrives(self._problem(own), solution.U)
             for place, i in enumerate(own.tolist()):
-                self.plans.iterations[fleets[i], vehicles[i]] += solution.iterations[place]
-                if fine[place] and cost[place] < best[i]:
-                    best[i] = cost[place]
-                    self._keep(fleets[i], vehicles[i], solution, place)
+                c, v = int(self.teams[i]), int(self.vehicles[i])
+                self.run.plans.iterations[c, v] += solution.iterations[place]
+                if fine[place] and cost[place] < self.cost[i]:
+                    self.cost[i] = cost[place]
+                    self.run.plans.set(v, torch.tensor([c]), solution, torch.tensor([place]))
             again = ~fine & (touch < 0) & (solution.violation <= ADMITTED)
             X0[left], U0[left] = solution.X, solution.U
             grown[left[again]] += BEYOND * -touch[again] + MORE
             left = left[again]
             if not len(left):
                 break
-        return torch.isfinite(best)
-
-    def _keep(self, b: Tensor, v: Tensor, solution: Solution, place: int) -> None:
-        self.plans.set(int(v), b.view(1), solution, torch.tensor([place]))
 
 
 def arrives(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:

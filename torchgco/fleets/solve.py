@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base import clock
 from torchgco.base.tree import put, take
+from torchgco.fleets.among import Among
+from torchgco.fleets.coming_apart import ComingApart
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.guesses import SIDES
+from torchgco.fleets.guesses import SIDES, aside
 from torchgco.fleets.plans import Plans, Solve
 from torchgco.fleets.prioritised import Prioritised
+from torchgco.fleets.shared_room import SharedRoom
 from torchgco.fleets.solution import FleetSolution
-from torchgco.fleets.together import MOST_STATES, around, together
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet
+from torchgco.problem.known import Known
+
+ORDERS = 4  # in which the vehicles of a fleet plan, side by side
 
 
 class _Best:
@@ -61,30 +69,42 @@ def solve_fleet(
     Args:
         solve: `torchgco.solve`.
         ids: (B,), of the random draws; None: 0..B-1.
-        solver: of vehicles alone, and among others where guesses don't do.
+        solver: of vehicles alone.
         ends: the time of the clock after which nothing more is begun, s.
     """
     ids = torch.arange(fleet.B) if ids is None else ids
+    late = partial(_late, ends)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
-        best = _Best(fleet, first.take(torch.arange(fleet.B)))
-        is_small = fleet.states <= MOST_STATES
-        for side in SIDES if is_small else ():
-            rows = best.open
-            if len(rows) and not _late(ends):
-                some, plans = fleet.take(rows.tolist()), first.take(rows)
-                for found in around(some, plans, side, solve):
-                    best.offer(rows, found)
-        rows = best.open
-        if len(rows) and not _late(ends):
-            some = fleet.take(rows.tolist())
-            found = Prioritised(some, first.take(rows), solve, seed, ids[rows], solver).run()
-            best.offer(rows, found)
-            if is_small and not _late(ends):
-                for polished in together(some, found.X, found.U, found, solve):
-                    best.offer(rows, polished)
-    return FleetSolution(fleet, best.plans.solutions(fleet), best.verdict)
+        best, forms = _Best(fleet, first.take(torch.arange(fleet.B))), [Among(one, Known()) for one, _ in fleet.forms]
+        for side in SIDES:
+            if len(rows := best.open) > 0 and not late():
+                apart = ComingApart(fleet, forms, rows, aside(fleet, forms, rows, first.take(rows), side), late)
+                plans = apart.run()
+                near = apart.near.nonzero().flatten()
+                _improve(best, forms, rows[near], plans.take(near), late)
+        if len(rows := best.open) > 0 and not late():
+            orders = [order for number in ids[rows].tolist() for order in _orders(fleet, seed, number)]
+            of = rows.repeat_interleave(ORDERS)
+            teams = Prioritised(fleet, forms, of, first.take(of), orders, late).run()
+            for i in range(ORDERS):
+                best.offer(rows, teams.take(torch.arange(i, len(of), ORDERS)))
+            rows = rows[best.verdict.reached[rows]]
+            _improve(best, forms, rows, best.plans.take(rows), late)
+    return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
+
+
+def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
+    """Offer what sharing the room makes of plans for some fleets, (b,)."""
+    if len(rows) > 0 and not late():
+        best.offer(rows, SharedRoom(best.fleet, forms, rows, plans, late).run())
+
+
+def _orders(fleet: Fleet, seed: int, number: int) -> list[list[int]]:
+    """Orders of a fleet's vehicles."""
+    rng = np.random.default_rng((seed, number))
+    return [rng.permutation(fleet.V).tolist() for _ in range(ORDERS)]
 
 
 def _late(ends: float | None) -> bool:

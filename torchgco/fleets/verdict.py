@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchgco.base.tree import take
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
+from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets.fleet import Fleet
 from torchgco.judging.judge import Verdict, judge
 from torchgco.obstacles.measured import segment_distance
@@ -26,6 +27,7 @@ class FleetVerdict:
     cost: Tensor  # the sum of all vehicles
     # Smallest distance between two centres that keep one, at any time, m; infinite where none do.
     least_distance: Tensor
+    apart: Tensor  # (B, V) bool: whether a vehicle keeps its distances at the knots, and touches nobody between them
     violation: Tensor  # largest of the vehicles and of pairs at the knots
     clearance: Tensor  # smallest distance to contact of vehicles and pairs, between the knots too, m
     feasible: Tensor  # bool: every vehicle is, pairs keep their distance at the knots, and none touches between them
@@ -43,26 +45,26 @@ def judge_fleet(fleet: Fleet, U: Sequence[Tensor]) -> FleetVerdict:
     X: list[Tensor] = [*U]
     for problem, whose in fleet.forms:
         controls = torch.cat([U[v] for v in whose])
-        verdict, states = judge(problem, controls), rollout(problem, controls)
+        verdict, states = judge(problem, controls), open_loop(problem.dynamics, problem.x0, controls)
         for place, v in enumerate(whose):
             rows = slice(place * fleet.B, (place + 1) * fleet.B)
             verdicts[v], X[v] = take(verdict, rows), states[rows]
-    p = fleet.places(X)
-    at_knots = (p.unsqueeze(1) - p.unsqueeze(2)).norm(dim=-1).amin(-1)
+    i, j = fleet.pairs_kept
+    keep, p = fleet.distances[i, j], fleet.places(X)
+    at_knots = (p[:, i] - p[:, j]).norm(dim=-1).amin(-1)
     least = torch.minimum(at_knots, _least(fleet, X, U))
-    keep = fleet.distances.triu()
-    some = keep > 0
-    short = torch.where(some, keep - at_knots, 0.0).flatten(1).amax(-1).clamp(min=0.0)
-    touch = torch.where(some, least - CONTACT_FACTOR * keep, torch.inf).flatten(1).amin(-1)
+    touches = (keep - at_knots > ADMITTED) | (least < CONTACT_FACTOR * keep)
+    close = touches.long().new_zeros(fleet.B, fleet.V).index_add(1, i, touches.long()).index_add(1, j, touches.long())
+    short, touch = (keep - at_knots).amax(-1).clamp(min=0.0), (least - CONTACT_FACTOR * keep).amin(-1)
     violation = torch.stack([v.violation for v in verdicts]).amax(0).maximum(short)
     own = torch.stack([v.clearance for v in verdicts]).amin(0)
-    feasible = torch.stack([v.feasible for v in verdicts]).all(0) & (short <= ADMITTED) & (touch >= 0)
+    feasible = torch.stack([v.feasible for v in verdicts]).all(0) & ~touches.any(-1)
     arrived = [v.reached | (not states_goal(one)) for v, one in zip(verdicts, fleet.members, strict=True)]
     cost, reached = torch.stack([v.cost for v in verdicts]).sum(0), feasible & torch.stack(arrived).all(0)
-    distance = torch.where(some, least, torch.inf).flatten(1).amin(-1)
     return FleetVerdict(
-        tuple(verdicts), cost, distance, violation, torch.minimum(own, touch), feasible, reached, makespan(fleet, X)
-    )
+        tuple(verdicts), cost, least.amin(-1), close == 0, violation, torch.minimum(own, touch), feasible, reached,
+        makespan(fleet, X),
+    )  # fmt: skip
 
 
 def states_goal(one: Problem) -> bool:
@@ -85,20 +87,13 @@ def makespan(fleet: Fleet, X: Sequence[Tensor]) -> Tensor:
     return fleet.dt * last
 
 
-def rollout(one: Problem, U: Tensor) -> Tensor:
-    """States (B, N+1, n) that controls (B, N, m) lead to."""
-    X = [one.x0]
-    for k in range(one.N):
-        X.append(one.dynamics.at(k).step(X[-1], U[:, k]))
-    return torch.stack(X, dim=1)
-
-
 def _least(fleet: Fleet, X: Sequence[Tensor], U: Sequence[Tensor]) -> Tensor:
-    """Smallest distances (B, V, V), along chords that paths leave by no more than 1e-3 m."""
+    """Smallest distances (B, Q) of the pairs, along chords that paths leave by no more than 1e-3 m."""
     p = fleet.places(X)
     off = torch.stack([leaves_chords(*part) for part in zip(fleet.members, X, U, strict=True)]).amax(0)
     pieces = (off / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST).long()
-    found = p.new_empty(fleet.B, fleet.V, fleet.V)
+    i, j = fleet.pairs_kept
+    found = p.new_empty(fleet.B, len(i))
     for count in pieces.unique().tolist():
         rows = (pieces == count).nonzero().flatten()
         fine = p[rows]
@@ -107,7 +102,9 @@ def _least(fleet: Fleet, X: Sequence[Tensor], U: Sequence[Tensor]) -> Tensor:
             inner = _places_within(fleet, members, x, u, count).unflatten(2, (fleet.N, count - 1))
             ahead = torch.cat((fine[:, :, :-1].unsqueeze(3), inner), dim=3).flatten(2, 3)
             fine = torch.cat((ahead, fine[:, :, -1:]), dim=2)
-        found[rows] = _gaps(fine, fine)
+        for b, way in zip(rows.tolist(), fine, strict=True):  # one fleet at a time: bounds the memory
+            away = way[i] - way[j]
+            found[b] = segment_distance(away[:, :-1], away[:, 1:]).amin(-1)
     return found
 
 
@@ -129,12 +126,3 @@ def _within(one: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:
     k = torch.arange(one.N, device=X.device).repeat_interleave(count - 1)
     h = dt / count * torch.arange(1, count, dtype=X.dtype, device=X.device).repeat(one.N)
     return between(one.dynamics, X, U, k, h, torch.full_like(h, dt))
-
-
-def _gaps(p: Tensor, q: Tensor) -> Tensor:
-    """Smallest distances (B, V, V) between the ways through places (B, V, K, d), all at the same times."""
-    found = []
-    for i in range(p.shape[1]):
-        away = p[:, i : i + 1] - q
-        found.append(segment_distance(away[:, :, :-1], away[:, :, 1:]).amin(-1))
-    return torch.stack(found, dim=1)

@@ -77,24 +77,7 @@ def judge(
     start: Tensor | None = None,
     times: Tensor | None = None,
 ) -> Verdict:
-    """Judge controls U (B, N, m) by their rollout from the start: any controls of any model, in float64.
-
-    Args:
-        problem: the problems; of a model without a position cost, violation and feasibility are judged. Those in
-            float32 are judged in float64, with their numbers as they are.
-        U: controls, float64 or float32; NaN where a solver returned none: such a problem is neither feasible nor
-            reached.
-        goal: positions (B, d) or (d,), m. None: the problem's goal; where it has none, nothing is reached.
-        goal_radius: number or (B,), m, above 0. None: that of the problem's goal.
-        start: (B, n), the starts found, such as `solution.X[:, 0]`, where some are free. One that differs from x0 in a
-            component that isn't free is not feasible. None: x0, where none is free.
-        times: (B, N+1), s, of the knots where the time is free, such as `solution.t`; a duration out of its bounds is
-            not feasible. None: the time isn't free.
-
-    Raises:
-        InputError: U, goal, radius or start don't fit the problem, a goal is given without a radius, or for dynamics
-            without a position, starts are free and none are given, or obstacles are of a kind that can't be judged.
-    """
+    """Judge controls U (B, N, m) by their rollout; arguments, and errors, are those of `torchgco.judge`."""
     problem = current_problem(problem)
     single = problem.x0.dtype == torch.float32
     problem, U = row_by_row(in_double(problem)), doubled(U, "U", problem)

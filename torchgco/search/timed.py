@@ -99,17 +99,22 @@ class Timed(Row):
         rows, X = rows[left], X[left]
         search.best.worked[rows] = True
         for finer in FINER:
-            found = self._ways(search.call.problem.take(rows), X, finer)
+            found = ways_in_time(search.call.problem.take(rows), X, self.ways, finer)
             arrived = _solve_along(search, rows, found)
             rows, X = rows[~arrived], X[~arrived]
             if rows.numel() == 0 or search.call.late:
                 return
 
-    def _ways(self, problem: Problem, X: Tensor, finer: float) -> list[TimedWays]:
-        """The ways of every problem."""
-        each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
-        scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
-        return timed_ways(scenes, self.ways, DEARER)
+
+def ways_in_time(problem: Problem, X: Tensor, most: int, finer: float = 1.0) -> list[TimedWays]:
+    """Up to `most` ways of every problem through a lattice in space and time; see `scene_in_time`.
+
+    Args:
+        X: trajectories without obstacles (B, N+1, n).
+    """
+    each = [problem.take(torch.tensor([b], device=X.device)) for b in range(problem.B)]
+    scenes = [scene_in_time(one, X[b], finer) for b, one in enumerate(each)]
+    return timed_ways(scenes, most, DEARER)
 
 
 def _free(search: Search, rows: Tensor) -> tuple[Tensor, Tensor]:

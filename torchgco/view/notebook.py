@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from torchgco.base.errors import InputError
@@ -46,6 +48,27 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         t = None if t_of is None else t_of[b, : last + 1]
         document.add(f"problem {b}", problem, b, [flight.until(last)], search_of(solution, problem, b), t)
     return HtmlPage(page(document), "Trajectories among obstacles")
+
+
+def show_fleet(members: Sequence[Problem], solutions: Sequence[Solution]) -> HtmlPage:
+    """The page of fleets, each with a colour for every vehicle, among the obstacles of the first one.
+
+    Args:
+        members: a problem per vehicle, of B fleets, all with a radius where they have obstacles.
+    """
+    first, names = members[0], [f"vehicle {v}" for v in range(len(members))]
+    flights = []
+    for name, one, found in zip(names, members, solutions, strict=True):
+        rows, results, touching = _told(one, found)
+        flights.append(
+            flights_of(one, look_of(one.dynamics), found.X, found.U, name, results, rows, ADMITTED, touching)
+        )
+    about = f"{first.B} fleets of {len(members)} vehicles, {first.N} stages"
+    dt, look = float(first.dynamics.dt), look_of(first.dynamics)
+    document = Document.of(first, title="torchgco", about=about, dt=dt, look=look, solvers=names)
+    for b in range(first.B):
+        document.add(f"fleet {b}", first, b, [each[b] for each in flights])
+    return HtmlPage(page(document), "Fleets among obstacles")
 
 
 def _times(problem: Problem, solution: Solution) -> tuple[np.ndarray | None, float]:

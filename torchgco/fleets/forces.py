@@ -1,0 +1,144 @@
+"""Forces between vehicles that are in balance: where they move the vehicles of one fleet, to first order.
+
+Each vehicle's trajectory is the minimum of its own cost under the forces of others, and answers to a change of these by
+a linear response. Forces push apart, and only pairs that touch. The forces are then the multipliers of a quadratic
+programme: find l >= 0 with M l - q >= 0 and l'(M l - q) = 0, M the response of gaps to forces.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchgco.lagrangian.kkt import RightSides
+from torchgco.problem.problem import Problem
+from torchgco.sensitivity.points import rows_that_hold, solve_at
+from torchgco.solution import Solution
+
+TINY = 1e-9  # m, below which two places are one
+AT_ONCE = 64  # problems whose responses are computed together
+SOFT = 1e-6  # share of the responses by which pairs give way: rows that depend on each other have no unique forces
+STEPS = 40  # of the interior point on forces, at most
+ENOUGH = 1e-8  # product of force and gap at its end, as a share of the first one
+SHORT = 0.99  # share of the way to where a force or a gap would be 0
+
+
+def balancing_forces(
+    normals: Tensor, gaps: Tensor, needed: Tensor, forces: Tensor, responses: Tensor, near: float
+) -> tuple[Tensor, Tensor]:
+    """Where V vehicles go, as changes of their places (V, K, d), m, and the forces (V, K, d) that move them there.
+
+    Args:
+        normals: along which two push each other, from vehicle j to vehicle i, (V, V, K, d).
+        gaps: how far apart they are along these, (V, V, K), m.
+        needed: the gaps that pairs need, (V, V, K), m; 0 of those that need none.
+        forces: that act on the vehicles now, (V, K, d).
+        responses: of places at knots 1..N to forces there, (V, N d, N d).
+        near: by how many times the gap that they need others may be farther apart.
+    """
+    V, K, d = forces.shape
+    if not bool(torch.isfinite(responses).all()):
+        return torch.zeros_like(forces), forces
+    freed = -(responses @ forces[:, 1:].flatten(1).unsqueeze(-1)).view(V, K - 1, d)
+    gap, keep = gaps[:, :, 1:], needed[:, :, 1:]
+    close = (keep > 0) & (gap < (1.0 + near) * keep) & torch.ones(V, V, dtype=torch.bool).triu(1).unsqueeze(-1)
+    i, j, k = close.nonzero(as_tuple=True)
+    if len(i) == 0:
+        return torch.cat((torch.zeros_like(freed[:, :1]), freed), dim=1), torch.zeros_like(forces)
+    normal = normals[:, :, 1:][i, j, k]
+    M = forces.new_zeros(len(i), len(i))
+    R = responses.view(V, K - 1, d, K - 1, d)
+    for v in range(V):
+        mine = ((i == v) | (j == v)).nonzero().flatten()
+        along = torch.where(i[mine] == v, 1.0, -1.0).unsqueeze(-1) * normal[mine]
+        at = k[mine]
+        between = R[v][at][:, :, at]  # (r, d, r, d)
+        M[mine.unsqueeze(1), mine] += torch.einsum("ra,rasb,sb->rs", along, between, along)
+    q = keep[i, j, k] - gap[i, j, k] - (normal * (freed[i, k] - freed[j, k])).sum(-1)
+    size = balanced(M, q)
+    push = torch.zeros_like(freed)
+    push.index_put_((i, k), size.unsqueeze(-1) * normal, accumulate=True)
+    push.index_put_((j, k), -size.unsqueeze(-1) * normal, accumulate=True)
+    moved = freed + (responses @ push.flatten(1).unsqueeze(-1)).view(V, K - 1, d)
+    return torch.cat((torch.zeros_like(moved[:, :1]), moved), dim=1), torch.cat(
+        (torch.zeros_like(push[:, :1]), push), dim=1
+    )
+
+
+def balanced(M: Tensor, q: Tensor) -> Tensor:
+    """The l >= 0 (R,) with M l - q >= 0 and l'(M l - q) = 0, M (R, R) symmetric and positive semidefinite.
+
+    By the primal-dual method of S. Mehrotra (1992).
+    """
+    M = 0.5 * (M + M.T) + SOFT * M.diagonal().mean() * torch.eye(len(q), dtype=M.dtype)
+    most = q.abs().max().clamp(min=TINY)
+    l, w = torch.full_like(q, float(most / M.diagonal().mean())), torch.full_like(q, float(most))
+    first = float(l @ w) / len(q)
+    for _ in range(STEPS):
+        left, mean = M @ l - q - w, float(l @ w) / len(q)
+        if mean < ENOUGH * first and float(left.abs().max()) < TINY:
+            break
+        factor, failed = torch.linalg.cholesky_ex(M + torch.diag(w / l))
+        if int(failed) != 0:
+            break
+        dl, dw = _step(factor, left, l, w, torch.zeros_like(l))
+        t = min(_most(l, dl), _most(w, dw))
+        center = (float((l + t * dl) @ (w + t * dw)) / len(q) / mean) ** 3 * mean
+        dl, dw = _step(factor, left, l, w, center - dl * dw)
+        t = min(1.0, SHORT * min(_most(l, dl), _most(w, dw)))
+        l, w = l + t * dl, w + t * dw
+    return l
+
+
+def _step(factor: Tensor, left: Tensor, l: Tensor, w: Tensor, aim: Tensor) -> tuple[Tensor, Tensor]:
+    """The step of l and w to where, to first order, no gap is left and the products l w are `aim`."""
+    right = -left + (aim - l * w) / l
+    dl = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+    return dl, (aim - l * w - w * dl) / l
+
+
+def _most(z: Tensor, change: Tensor) -> float:
+    """The step up to which z stays at least 0, at most 1 / SHORT."""
+    ratio = torch.where(change < 0, -z / change, torch.inf)
+    return min(float(ratio.min()), 1.0 / SHORT)
+
+
+def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals (c, V, V, K, d) of planes between any two of the places p (c, V, K, d), and how far apart these are along
+    them, (c, V, V, K), m.
+
+    At each knot the shortest way between the two, then or in the stages beside it: so who passes whom on which side
+    stays as it is, however fast they are.
+    """
+    away = p.unsqueeze(2) - p.unsqueeze(1)
+    a, along = away[..., :-1, :], away.diff(dim=-2)
+    share = -(a * along).sum(-1) / along.square().sum(-1).clamp(min=torch.finfo(p.dtype).tiny)
+    nearest = a + share.clamp(0.0, 1.0).unsqueeze(-1) * along
+    before = torch.cat((nearest[..., :1, :], nearest), dim=-2)
+    after = torch.cat((nearest, nearest[..., -1:, :]), dim=-2)
+    nearer = (before.norm(dim=-1) < after.norm(dim=-1)).unsqueeze(-1)
+    way = torch.where(nearer, before, after)
+    size = way.norm(dim=-1, keepdim=True)
+    v, aside = torch.arange(p.shape[1]), torch.zeros_like(away)
+    aside[..., 0] = (v.unsqueeze(1) - v).sign().view(1, len(v), len(v), 1).to(away)  # of two at one place
+    normals = torch.where(size > TINY, way / size.clamp(min=TINY), aside)
+    return normals, (normals * away).sum(-1)
+
+
+def responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
+    """Of places at knots 1..N to forces there, (B, N d, N d), m per unit; NaN where the minimum isn't strict."""
+    parts = torch.arange(problem.B).split(AT_ONCE)
+    return torch.cat([_responses(problem.take(rows), solution.take(rows), position) for rows in parts])
+
+
+def _responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
+    holds, _ = rows_that_hold(problem, solution)
+    B, N, n, d = problem.B, problem.N, problem.n, position.stop - position.start
+    a = solution.X.new_zeros(N, d, B, N + 1, n + problem.m)
+    for k in range(N):
+        for axis in range(d):
+            a[k, axis, :, k + 1, position.start + axis] = -1.0
+    gaps, none = a.new_zeros(()).expand(N * d, B, N, n), a.new_zeros(()).expand(N * d, B, holds.shape[1])
+    found = solve_at(problem, solution, holds, RightSides(a.flatten(0, 1), gaps, none))
+    moved = found.z[:, :, 1:, position].permute(1, 2, 3, 0).flatten(1, 2)
+    return torch.where(found.definite.view(-1, 1, 1), moved, torch.nan)
