@@ -115,7 +115,7 @@ def test_shares_add_up(tmp_path: Path) -> None:
     for phase in sums:
         parts = [float(row["value"]) for row in rows if row["solver"] == phase and row["quantity"] != "sum"]
         assert sum(parts) == pytest.approx(sums[phase], abs=0.1)
-    assert {"tgco_outer", "tgco_value"} <= {row["quantity"] for row in rows if row["solver"] == "all"}
+    assert {"tgco_outer", "tgco_gains"} <= {row["quantity"] for row in rows if row["solver"] == "all"}
 
 
 def test_the_targets_are_read_off_the_rows(tmp_path: Path) -> None:

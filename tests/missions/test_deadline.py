@@ -73,7 +73,7 @@ def test_attempts_stop(name: str, clock: list[int]) -> None:
     """The more time, the more passes; all in all fewer than without a limit."""
     problem, U0 = planar_batch(B=3, N=30, obstacles=9, seed=4)
     solver, passes = SOLVERS[name](problem), []
-    for limit in (1.5, 6.5, None):
+    for limit in (2.5, 7.5, None):
         seen: list[int] = []
         solver.solve(problem, U0, seed=3, max_seconds=limit, callback=lambda now, seen=seen: now.row or seen.append(1))
         passes.append(len(seen))

@@ -147,7 +147,7 @@ def test_a_trajectory_is_refined_among_the_obstacles_near_it(kind: str, enough: 
     _, many, U0 = planar(kind, 9.0)
     start = replace(quick_gco(many).solve(many, U0, seed=3), search=None, trace=None)
     if not enough:
-        monkeypatch.setattr(nearby, "_beside", lambda p, solids: torch.zeros_like(solids.absent))
+        monkeypatch.setattr(nearby, "_beside", lambda X, part, solids: torch.zeros_like(solids.absent))
     found = refined(many, U0, start)
     monkeypatch.setattr(Nearby, "along", classmethod(lambda cls, call, X: None))
     whole = refined(many, U0, start)
