@@ -40,9 +40,8 @@ MORE = 1e-4  # m, by which pairs stay farther apart between the knots than where
 BEYOND = 1.5  # times what touches an obstacle between the knots, by which it is larger in the next round
 BACK, ON = 0.3, 2.0  # times the step of the planes after a round that fails, and after one that serves
 SHORTEST = 0.05  # step
-LOOSE = (
-    0.03  # share of what two keep by which they may come closer on the way to it: planes with no room have no inside
-)
+# Share of what two keep by which they may come closer on the way to it: planes with no room have no inside.
+LOOSE = 0.03
 
 
 @dataclass
