@@ -14,14 +14,15 @@ from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.constraints.bounds import LOOSE
-from torchgco.export.numbers import Changing, Copies, fixed_radii
+from torchgco.export.numbers import ABOVE_ZERO, AT_LEAST_ZERO, BOUND, Changing, Copies, fixed_radii
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
 from torchgco.native.declarations import Structure, defines
 from torchgco.native.kept import Kept
 from torchgco.native.packing import kind_of
+from torchgco.receding.plan import STAGE_ROUNDING
 from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import SADDLE_STEPS, InteriorPoint
 
 HERE = Path(__file__).parent / "c"
 TYPES = {
@@ -285,7 +286,9 @@ def _constants(interior: InteriorPoint, constrained: bool) -> str:
         "WARM_MU": interior.warm_barrier, "WARM_PUSH": interior.warm_barrier, "COLD_MU": interior.initial_barrier,
         "COLD_PUSH": interior.bound_push, "VIOLATION": interior.violation_tolerance, "ADMITTED": ADMITTED,
         "MAX_SOLVE_ITERATIONS": interior.max_iterations, "LOOSE": LOOSE, "CONTACT": CONTACT_FACTOR,
-        "STATIONARY": STATIONARY, "CONSTRAINED": int(constrained),
+        "STATIONARY": STATIONARY, "CONSTRAINED": int(constrained), "STAGE_ROUNDING": STAGE_ROUNDING,
+        "SADDLE_FIRST": SADDLE_STEPS[0], "SADDLE_LAST": SADDLE_STEPS[1],
+        "AT_LEAST_ZERO": AT_LEAST_ZERO, "ABOVE_ZERO": ABOVE_ZERO, "BOUND": BOUND,
     }  # fmt: skip
     return defines(values)
 

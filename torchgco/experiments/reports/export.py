@@ -198,7 +198,7 @@ def _write_c(options: argparse.Namespace) -> int:
     """The controller of one problem, of a study or of a configuration."""
     words, name = options.run, options.c
     if given := [word for word in ("rate", "solver", "bag") if getattr(options, word)]:
-        raise InputError(f"--{given[0]}", "not with --c", getattr(options, given[0]))
+        raise InputError(f"--{given[0]}", "none beside --c", getattr(options, given[0]))
     if len(words) == 1 and "=" not in words[0]:
         folder, made = Path(words[0]), Study.read(Path(words[0]), options.trust)
         missions, layouts, vehicle, output = made.missions, made.layouts, made.vehicle, folder / FOLDER / name

@@ -42,7 +42,7 @@ static void shift(double *values, const int32_t *place, int count, int width, do
 /* A whole number of stages where it is one but for rounding. */
 static double rounded(double stages) {
     double whole = floor(stages + 0.5), size = stages > 1 ? stages : 1;
-    return fabs(stages - whole) <= 1e-6 * size ? whole : stages;
+    return fabs(stages - whole) <= STAGE_ROUNDING * size ? whole : stages;
 }
 
 /* u within the bounds of controls at knot k; what is no number becomes 0 first. */
@@ -68,8 +68,8 @@ static int has_bad_number(const NAME_workspace *w, const Solve *b) {
     for (int i = 0; i < (int)(sizeof checks / sizeof *checks); i++)
         for (int j = checks[i].first; j < checks[i].first + checks[i].count; j++) {
             int kind = checks[i].kind, is_finite_number = numbers[j] - numbers[j] == 0;
-            if (numbers[j] != numbers[j] || (kind < 3 && !is_finite_number)) return 1;
-            if ((kind == 1 && numbers[j] < 0) || (kind == 2 && numbers[j] <= 0)) return 1;
+            if (numbers[j] != numbers[j] || (kind != BOUND && !is_finite_number)) return 1;
+            if ((kind == AT_LEAST_ZERO && numbers[j] < 0) || (kind == ABOVE_ZERO && numbers[j] <= 0)) return 1;
         }
     for (int64_t i = 0; i < b->problem.constraints; i++) {
         const Constraint *con = b->problem.constraint + i;
@@ -319,7 +319,7 @@ static void step_beside(const Solve *b, double share, double *u) {
 /* From rest; where the conditions of first order hold but the cost falls to second order, from beside, too. Returns the
    status of what is found, in b->X and b->U. */
 static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until) {
-    static const double shares[] = {1e-3, 1e-1};
+    static const double shares[] = {SADDLE_FIRST, SADDLE_LAST};
     double guess_cost, guess_violation, cost, largest = 0;
     if (starts_inside(b, x)) return INVALID_START;
     rest(w, b, x);
