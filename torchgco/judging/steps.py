@@ -26,7 +26,7 @@ ORDER_OF = {"euler": 1, "midpoint": 2, "rk4": 4}
 # Step errors above these are large. Euler's difference is a quarter of the second difference of the states, half of
 # their range at most, which controls that change at every stage come close to without a stiff model.
 LARGE_ERROR = {"euler": 0.5, "midpoint": 0.1, "rk4": 0.1}
-LARGE_COST = 0.01  # step costs above this are large
+LARGE_COST = 0.01  # costs that are off by more than this share are, and the step costs by which they show
 # A method of order p changes the cost by c / N^p where nothing changes faster than within the whole duration: up to so
 # much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
 COARSE = 2.5
@@ -86,6 +86,9 @@ def step_errors(
     error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), torch.zeros_like(zeros, dtype=torch.bool))
     if not _halves(problem):
         return error
+    method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
+    order = ORDER_OF[method]
+    too_much = (COARSE / stages**order).clamp(min=(1.0 - 0.5**order) * LARGE_COST)
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
             e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
@@ -93,8 +96,8 @@ def step_errors(
             error.step_error[rows], error.stage[rows], error.state[rows] = worst, index // problem.n, index % problem.n
             asked = torch.isfinite(worst)
             if doubted:
-                asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
-                asked &= worst > HARMLESS_ERROR[problem.dynamics.integrator]
+                asked &= share.amax(-1).sum(-1) > too_much[rows] / ELASTIC
+                asked &= worst > HARMLESS_ERROR[method]
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             chosen = asked.nonzero().flatten()
             if chosen.numel() > 0:
@@ -104,8 +107,6 @@ def step_errors(
                     problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()], costates
                 )
             error.step_cost[rows] = costs
-        method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
-        too_much = (COARSE / stages ** ORDER_OF[method]).clamp(min=LARGE_COST)
         error.large[:] = (error.step_error > LARGE_ERROR[method]) | (error.step_cost > too_much)
     return error
 
