@@ -54,9 +54,9 @@ def drawn(seed: int) -> tuple[Vehicle, Layouts]:
     kind, model = (Vehicle, Unicycle) if seed % 2 == 0 else (Elsewhere, Backwards)
     vehicle = kind(
         name="further" if seed >= 4 else "own", dynamics=model(dt=rng.uniform(0.05, 0.3)), state_weight=[1] * 4,
-        control_weight=[1, 1], terminal_weight=[1] * 4, control_reference=[0, 0], control_lower=[-2, -2], control_upper=[2, 2],
-        start=rng.uniform(-1, 1, 4).tolist(), goal=rng.uniform(4, 6, 4).tolist(), radius=rng.uniform(0.1, 0.5),
-        goal_radius=rng.uniform(0.2, 1), stages=int(rng.integers(10, 20)),
+        control_weight=[1, 1], terminal_weight=[1] * 4, control_reference=[0, 0], control_lower=[-2, -2],
+        control_upper=[2, 2], start=rng.uniform(-1, 1, 4).tolist(), goal=rng.uniform(4, 6, 4).tolist(),
+        radius=rng.uniform(0.1, 0.5), goal_radius=rng.uniform(0.2, 1), stages=int(rng.integers(10, 20)),
     )  # fmt: skip
     given: dict[str, Any] = {
         "start": rng.uniform(-1, 1, (L, 4)), "goal": rng.uniform(4, 6, (L, 4)), "dt": rng.uniform(0.05, 0.3),
