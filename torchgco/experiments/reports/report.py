@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
@@ -30,6 +31,7 @@ from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
+from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -90,7 +92,8 @@ def write_report(
 
 
 def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any]]:
-    """The arrays of layouts as problems are made of them, the vehicle's body where it is no ball, and its position."""
+    """The arrays of layouts as problems are made of them, the vehicle's body where it is no ball, its position, and the
+    obstacles of each problem."""
     if tasks is None:
         return layouts.arrays(), {}
     groups = layouts.alike()
@@ -100,9 +103,12 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
     if first.dynamics.position is None:
         return arrays, how
     start, goal = (np.full((layouts.count, layouts.dimension), np.nan) for _ in range(2))
+    obstacles: list[tuple[Obstacles, ...]] = [()] * layouts.count
     for places, task in zip(groups, made, strict=True):
         start[places], goal[places] = task.problem.x0[:, task.problem.position].numpy(), task.goal.numpy()
-    return {**arrays, "start": start, "goal": goal}, how
+        for row, place in enumerate(places):
+            obstacles[place] = task.problem.take(torch.tensor([row])).obstacles
+    return {**arrays, "start": start, "goal": goal}, {**how, "obstacles": obstacles}
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
