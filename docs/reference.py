@@ -28,7 +28,8 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "api")
     output = parser.parse_args(words).output
-    vars(torchgco)["compose"] = torchgco.compose  # imported lazily: pdoc looks for it in the module
+    for name in ("compose", "read"):  # imported lazily: pdoc looks for them in the module
+        vars(torchgco)[name] = getattr(torchgco, name)
     for page in pdoc.extract.walk_specs(PAGES):
         pdoc.extract.load_module(page)
     for kind in _classes():

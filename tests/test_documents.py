@@ -314,7 +314,7 @@ def test_every_public_name_exists() -> None:
     assert len(set(torchgco.__all__)) == len(torchgco.__all__)
     held = vars(torchgco).items()
     public = {name for name, value in held if getattr(value, "__module__", "").startswith("torchgco.")}
-    assert public | {"compose", "presets"} == set(torchgco.__all__)
+    assert public | {"compose", "presets", "read"} == set(torchgco.__all__)
     for name in torchgco.__all__:
         assert getattr(torchgco, name) is not None
 

@@ -24,7 +24,7 @@ from torchgco.experiments.config.build import forget_composed, plain, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
 from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
 from torchgco.experiments.ending import Refused, ended, raised, say, silence
-from torchgco.experiments.flying.jobs import Report
+from torchgco.experiments.flying.jobs import SWEPT, Report
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.identity import decisive, digest, settings_of
 
@@ -76,6 +76,7 @@ def _task(config: DictConfig) -> Report:
             done = run_study(
                 plain(config), folder, recomposer(overrides, job.runtime.config_sources),
                 lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],
+                swept=tuple(SWEPT),
             )  # fmt: skip
     except (InputError, HydraException, OmegaConfBaseException) as error:
         _remove_empty(folder)

@@ -29,7 +29,7 @@ from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, pa
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
-from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
+from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -119,7 +119,7 @@ def drawings(part: Part) -> Drawings:
     mission, again = part.kind is MISSIONS, part.kind.summarise
     named, trials, summary, to_draw = "outcomes" if mission else "rates", part.trials, part.summary, {}
     swept = task_columns(trials)[len(TASK) :]
-    for name in swept:
+    for name in (name for name in swept if trials[name].nunique() > 1):
         others = [other for other in swept if other != name]
         rows, table = trials[trials[name].notna()], summary[summary[name].notna()]
         if len(table[[*TASK, *others]].drop_duplicates()) > FACETS:
@@ -158,6 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
+    words = "one table of all trials in place of statistics: trials.csv, and on stdout with --format"
+    parser.add_argument("--long", action="store_true", help=words)
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     return parser.run(arguments, _run)
 
@@ -181,7 +183,8 @@ def _report(options: argparse.Namespace) -> int:
     write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
-    say(write_report(output, trials=trials, form=options.format))
+    told = _long(output, trials, options.format) if options.long else None
+    say(told or write_report(output, trials=trials, form=options.format))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:
@@ -192,6 +195,13 @@ def _report(options: argparse.Namespace) -> int:
     for note in merged.attrs[UNFINISHED]:
         print(f"unfinished: {note}", file=sys.stderr)
     return 0
+
+
+def _long(output: Path, trials: pd.DataFrame, form: str) -> str:
+    """Write trials.csv, a row per solver and layout; returns what to print."""
+    table = plain(trials)
+    write(output / "trials.csv", lambda file: file.write(csv_text(table).encode()))
+    return f"{len(table)} trials, {len(table.columns)} columns" if form == "table" else format_frame(table, form)
 
 
 def _verify(options: argparse.Namespace) -> int:
