@@ -32,6 +32,7 @@ from tests.slow import mostly
 from torchgco import Problem
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
+from torchgco.experiments.referee import judge
 from torchgco.experiments.reports import export, identify, report, view
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.kernels import EagerWarning
@@ -91,7 +92,7 @@ def name_of(page: Path) -> str:
 
 
 REPORTS: dict[str, Callable[[list[str]], Any]] = {
-    f"torchgco-{module.__name__.rpartition('.')[2]}": module.main for module in (report, view, export, identify)
+    f"torchgco-{module.__name__.rpartition('.')[2]}": module.main for module in (report, view, export, identify, judge)
 }
 
 
