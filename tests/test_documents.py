@@ -99,7 +99,9 @@ REPORTS: dict[str, Callable[[list[str]], Any]] = {
 def accept(command: str) -> None:
     """Raise, or exit, unless the program accepts the command's arguments; runs nothing."""
     program, *words = shlex.split(command, comments=True)
-    if program == "torchgco":
+    if program == "torchgco" and words[:1] == ["new"]:
+        assert len(words) == 2
+    elif program == "torchgco":
         accept_overrides([word for word in words if word not in ("--help", "--version")])
     elif program in REPORTS:
         with pytest.MonkeyPatch.context() as patch:

@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError, first_line
 from torchgco.base.version import VERSION
+from torchgco.experiments import new
 from torchgco.experiments.config.build import forget_composed, plain, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
 from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
@@ -132,6 +133,8 @@ def _command() -> int:
     if "--version" in sys.argv[1:]:
         say(f"torchgco {VERSION}")
         return 0
+    if sys.argv[1:2] == ["new"]:
+        return new.main(sys.argv[2:])
     # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     forget_composed()  # the files of conf/ may have changed since the last call

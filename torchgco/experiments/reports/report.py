@@ -53,6 +53,7 @@ def write_report(
     tasks: Tasks | None = None,
     trials: pd.DataFrame | None = None,
     form: str = "table",
+    pdf: bool = False,
 ) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
@@ -65,6 +66,7 @@ def write_report(
             known.
         trials: the table in that file, where it is known.
         form: of the table that is returned, one of OUTPUTS.
+        pdf: whether figures are PDF, as papers take them, instead of PNG.
 
     Raises:
         InputError: the table is missing, unreadable or empty, or the trajectories don't fit the layouts.
@@ -85,6 +87,8 @@ def write_report(
                 to_draw[f"study.{ending}"] = lambda: study_figure(
                     layouts, states, trials, parts[0].summary, printed, **how
                 )
+    if pdf:
+        to_draw = {name if name.startswith("study.") else f"{name}.pdf": figure for name, figure in to_draw.items()}
     draw({name: partial(_draw, folder, name, figure) for name, figure in to_draw.items()})
     return format_report(parts, form)
 
@@ -160,6 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
     words = "one table of all trials in place of statistics: trials.csv, and on stdout with --format"
     parser.add_argument("--long", action="store_true", help=words)
+    parser.add_argument("--pdf", action="store_true", help="figures as PDF instead of PNG")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     return parser.run(arguments, _run)
 
@@ -184,7 +189,7 @@ def _report(options: argparse.Namespace) -> int:
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
     told = _long(output, trials, options.format) if options.long else None
-    say(told or write_report(output, trials=trials, form=options.format))
+    say(told or write_report(output, trials=trials, form=options.format, pdf=options.pdf))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:
