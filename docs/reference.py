@@ -1,4 +1,4 @@
-"""The API reference from the docstrings: `make docs`, into docs/api.
+"""The API reference from the docstrings: `make docs`, into docs/api; and docs/options.md, the options of solvers.
 
 The first page has what `torchgco` itself names; others have the packages that users import from besides. All else is
 inside, and documented in the source.
@@ -13,6 +13,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import get_type_hints
 
+import options
 import pdoc
 
 import torchgco
@@ -36,6 +37,7 @@ def main(words: list[str] | None = None) -> int:
         _resolve(kind)
     pdoc.render.configure(docformat="google")
     pdoc.pdoc(*PAGES, output_directory=output)
+    options.PAGE.write_text(options.text())
     return 0
 
 

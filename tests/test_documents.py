@@ -29,7 +29,7 @@ from benchmarks.families import oracle, quality
 from benchmarks.lib.command import Command
 from benchmarks.speed import __main__ as speed
 from tests.slow import mostly
-from torchgco import Problem
+from torchgco import Problem, presets
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.referee import judge
@@ -286,13 +286,31 @@ def test_every_extension_is_shown() -> None:
     assert shown == dict.fromkeys(kinds, 1) | {"Where is what": 0}
 
 
+def program(name: str) -> Any:
+    """A program of the manual, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_options_is_that_of_the_presets_and_their_docstrings() -> None:
+    options = program("options")
+    assert options.PAGE.read_text() == options.text(), "`make docs` writes it again"
+    lines = options.text().splitlines()
+    for name in presets.PRESETS:
+        assert f"### {name}" in lines
+    meanings = [line for line in lines[lines.index("## Meanings") :] if line.startswith("| `")]
+    assert len(meanings) > 90 and not [line for line in meanings if "` |  |" in line or "as of `" in line]
+    for option in ("| `passes.paths.num_paths` | `6` | `6` |", "| `passes.samples.redraws` | `2` | `3` |"):
+        assert any(line.startswith(option) for line in lines), option
+    assert any("`max_gap`" in line and "or null" in line and "twice as many paths" in line for line in meanings)
+
+
 @pytest.mark.skipif(find_compiler() is None, reason="the figures watch native kernels")
 def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "algorithm.md"
-    spec = importlib.util.spec_from_file_location("figures", page.parent / "figures.py")
-    assert spec is not None and spec.loader is not None
-    figures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(figures)
+    page, figures = ROOT / "docs" / "algorithm.md", program("figures")
     before = page.read_text()
     assert figures.main(["--output", str(tmp_path)]) == 0
     assert page.read_text() == before, "`make figures` brings the page up to date"

@@ -42,7 +42,11 @@ class Slalom(Scenario):
     discs: int = 3
     radius: float = 0.3  # m
     stages: int = 60
-    dimension = 2
+
+    @property
+    def dimension(self) -> int:
+        """Of space."""
+        return 2
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
         x = np.linspace(1.0, 4.0, self.discs)
