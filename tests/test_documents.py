@@ -107,7 +107,7 @@ def accept(command: str) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(RunParser, "run", lambda parser, arguments, work: parser.parse_args(arguments))
             options = REPORTS[program](words)
-        assert program != "torchgco-report" or options.folders
+        assert program != "torchgco-report" or options.folders or options.power
         accept_overrides(getattr(options, "words", []))
     elif program == "make":
         accept_make(words)

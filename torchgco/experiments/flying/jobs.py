@@ -51,6 +51,20 @@ class Report:
     refused: str | None = None
 
 
+class Scored(float):
+    """The number of a study, as a sweeper takes it, with the report of its job."""
+
+    def __new__(cls, number: float, report: Report) -> Scored:
+        made = super().__new__(cls, number)
+        made.report = report
+        return made
+
+    report: Report
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Scored, (float(self), self.report)
+
+
 def _exits(method: Callable[..., None]) -> Callable[..., None]:
     """Let a callback's error end the command: Hydra would turn it into a warning."""
 
@@ -97,7 +111,9 @@ class Jobs(Callback):
     @_exits
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """In a job of a sweep: write its report."""
-        if self.reports is not None and isinstance(report := job_return._return_value, Report):
+        report = job_return._return_value
+        report = report.report if isinstance(report, Scored) else report
+        if self.reports is not None and isinstance(report, Report):
             text = json.dumps(asdict(report)).encode()
             write(Path(self.reports) / f"{config.hydra.job.num:06d}.json", lambda file: file.write(text))
 

@@ -39,6 +39,7 @@ from torchgco.experiments.results.identity import (
     settings_of,
 )
 from torchgco.experiments.results.lock import held
+from torchgco.experiments.results.objective import check_objective
 from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.results.variants import values_of
@@ -181,6 +182,10 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
     tasks = Tasks(setup, setup.layouts())
     task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
     plan = plan_of(setup)
+    if (objective := configuration["study"]["objective"]) is not None:
+        check_objective(objective, setup.mission is not None)
+        if plan.jobs is not None:
+            raise InputError("study.objective", "null where jobs share a study: none of them has its number", objective)
     if setup.mission is not None:
         check_mission(setup.mission, task)
         if plan.explain:

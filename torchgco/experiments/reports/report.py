@@ -28,6 +28,7 @@ from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TR
 from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
+from torchgco.experiments.statistics.power import told
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
@@ -164,12 +165,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
     words = "one table of all trials in place of statistics: trials.csv, and on stdout with --format"
     parser.add_argument("--long", action="store_true", help=words)
+    words = "print how many layouts tell two rates apart, such as 0.9 0.8, and no report"
+    parser.add_argument("--power", nargs=2, type=float, metavar="RATE", help=words)
     parser.add_argument("--pdf", action="store_true", help="figures as PDF instead of PNG")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     return parser.run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.power is not None:
+        say(told(*options.power))
+        return 0
     if not options.folders:
         raise InputError("DIR", "a study, or a folder of studies", "none")
     return _verify(options) if options.verify else _report(options)
@@ -188,8 +194,8 @@ def _report(options: argparse.Namespace) -> int:
     write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
-    told = _long(output, trials, options.format) if options.long else None
-    say(told or write_report(output, trials=trials, form=options.format, pdf=options.pdf))
+    long = _long(output, trials, options.format) if options.long else None
+    say(long or write_report(output, trials=trials, form=options.format, pdf=options.pdf))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:
