@@ -16,14 +16,15 @@ from torchgco.base.options import Checked, Count, Seconds
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.integrators import INTEGRATORS, Integrator
 
 
 class Dynamics(PerElement, Checked):
     """x_{k+1} = step(x_k, u_k) on (..., n), (..., m).
 
     A model is a subclass with the numbers `n` and `m`, and one method: `field(x, u)`, the time derivative of x, with
-    the attributes `dt` (s) and `integrator` ("euler", "midpoint" or "rk4"); or `step(x, u)` itself.
+    the attributes `dt` (s) and `integrator` ("euler", "midpoint" or "rk4", and for stiff fields "implicit_euler",
+    "radau3" or "radau5"); or `step(x, u)` itself.
 
         class Car(Dynamics):
             n, m, dt, integrator, position = 4, 2, 0.05, "midpoint", slice(0, 2)
@@ -148,7 +149,7 @@ class FunctionDynamics(Dynamics, named="dynamics"):
     n: Count
     m: Count
     dt: Seconds
-    integrator: Literal["euler", "midpoint", "rk4", "none"] = "euler"
+    integrator: Integrator | Literal["none"] = "euler"
     position: slice | None = None
     values: Any = None
     knot_values: Any = None
