@@ -6,8 +6,8 @@ whose layouts are those of `benchmarks/data`. All entries there are judged, also
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from benchmarks.lib import ROOT
 from benchmarks.lib.command import Command
 from benchmarks.lib.families import FAMILIES
 from benchmarks.lib.page import markdown, share, shown
-from benchmarks.lib.provenance import provenance
 from benchmarks.lib.studies import flown
 from torchgco.base.version import VERSION
 from torchgco.experiments.referee.judge import main as judge
@@ -33,23 +32,23 @@ METHODS = {
 NAMES = {"interior_point": "interior point", "ipopt": "IPOPT", "fatrop": "FATROP", "fatrop_guided": "FATROP, guided"}
 
 
-def enter(solver: str, threads: int) -> None:
-    """Write the card of a solver."""
-    source = provenance("cpu")
-    peer = f", CasADi {source['casadi']}" if "ipopt" in solver or "fatrop" in solver else ""
+def enter(solver: str, families: Sequence[str]) -> None:
+    """Write the card of a solver, from the records of its flights."""
+    starts = [json.loads((FLOWN / family / "run.json").read_text())[-1] for family in families]
+    commits = ", ".join(dict.fromkeys(start["torchgco"]["commit"][:8] for start in starts))
+    peer = f", CasADi {starts[0]['packages']['casadi']}" if "ipopt" in solver or "fatrop" in solver else ""
     card = {
         "name": NAMES.get(solver, solver),
         "authors": "torchgco",
         "method": METHODS[solver],
-        "hardware": f"{source['processor']}, one core, {threads} thread, beside other work",
+        "hardware": f"{starts[0]['machine']['processor']}, one core, one thread, beside other work",
         "seeds": "0",
         "time": "wall time of a batch of 32 divided by its layouts; without set-up and compiling",
-        "date": date.today().isoformat(),
-        "version": f"torchgco {VERSION} at commit {source['commit']}{peer}",
+        "date": max(start["started"] for start in starts)[:10],
+        "version": f"torchgco {VERSION} at {commits}{peer}",
     }
     text = "".join(f"{key} = {value}\n" if key == "date" else f'{key} = "{value}"\n' for key, value in card.items())
     folder = BOARD / "entries" / solver
-    folder.mkdir(parents=True, exist_ok=True)
     (folder / "entry.toml").write_text(text)
 
 
@@ -62,15 +61,16 @@ def fly(family: str, solvers: Sequence[str]) -> None:
         for solver, U in zip(held["solver"].tolist(), held["U"], strict=True):
             seconds = trials.loc[trials["solver"] == solver].sort_values("layout")["seconds"].to_numpy()
             path = BOARD / "entries" / solver / f"{family}.npz"
+            path.parent.mkdir(parents=True, exist_ok=True)
             np.savez_compressed(path, U=U.astype(np.float32), seconds=seconds.astype(np.float32))
 
 
 def text(families: Sequence[str], solvers: Sequence[str]) -> str:
     """Fly, enter, judge; returns the table of the leaderboard."""
-    for solver in solvers:
-        enter(solver, threads=1)
     for family in families:
         fly(family, solvers)
+    for solver in solvers:
+        enter(solver, families)
     judge(["--board", str(BOARD)])
     return table(BOARD / "board.csv")
 

@@ -75,6 +75,20 @@ def test_an_npz_file_and_a_csv_file_of_the_same_controls_are_judged_alike(
     assert one["cost"].tolist() == verdict.cost.tolist()
 
 
+def test_a_csv_file_of_several_solvers(path: Path, U: np.ndarray, tmp_path: Path) -> None:
+    rows = pd.concat([table_of(U, solver="my solver, 2"), table_of(0 * U, solver="007")])
+    rows.to_csv(tmp_path / "both.csv", index=False)
+    np.savez(tmp_path / "my.npz", U=U)
+    trials = judge_files(path, [tmp_path / "both.csv", tmp_path / "my.npz"])
+    assert list(dict.fromkeys(trials["solver"])) == ["my solver, 2", "007", "my"]
+    costs = trials.groupby("solver")["cost"].apply(list)
+    assert costs["my solver, 2"] == costs["my"] != costs["007"] and set(trials["best_from"]) == {"file"}
+    rows["solver"] = None
+    rows.to_csv(tmp_path / "both.csv", index=False)
+    with pytest.raises(InputError, match="one row per stage, got two for layout 0, k 0"):
+        judge_files(path, [tmp_path / "both.csv"])
+
+
 @pytest.mark.parametrize("kind", ["<f4", ">f8", ">f4", "<f2", "i4"])
 def test_numbers_of_other_kinds_are_judged_as_they_are(kind: str, path: Path, U: np.ndarray, tmp_path: Path) -> None:
     given = np.nan_to_num(U).astype(kind)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.families.board import BOARD
 from tests.referee.boards import HOSTILE, SHAPES, board, enter
 from tests.view.browser import Tab
 from tests.view.test_browser import check_quiet
@@ -47,6 +48,16 @@ def test_rows_are_sorted_and_filtered(chromium: Callable[[], Tab], html: str, tm
         tab.size(360, 640)
         assert tab.evaluate("document.documentElement.scrollWidth") <= 360
         assert len(tab.screenshot()) > 1000
+    check_quiet(tab)
+
+
+def test_the_first_entries_are_shown(chromium: Callable[[], Tab]) -> None:
+    tab = chromium()
+    tab.size(1200, 800)
+    tab.open(BOARD / "board.html")
+    assert tab.evaluate(f"{ROWS}.length") == len((BOARD / "board.csv").read_text().splitlines()) - 1
+    tab.click("th:nth-child(3) button")
+    assert tab.evaluate("document.querySelector('th:nth-child(3)').ariaSort") == "ascending"
     check_quiet(tab)
 
 
