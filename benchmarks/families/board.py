@@ -34,7 +34,8 @@ NAMES = {"interior_point": "interior point", "ipopt": "IPOPT", "fatrop": "FATROP
 
 def enter(solver: str, families: Sequence[str]) -> None:
     """Write the card of a solver, from the records of its flights."""
-    starts = [json.loads((FLOWN / family / "run.json").read_text())[-1] for family in families]
+    records = [json.loads((FLOWN / family / "run.json").read_text()) for family in families]
+    starts = [max(record, key=lambda start: start["processor_seconds"] or 0.0) for record in records]  # that flew
     commits = ", ".join(dict.fromkeys(start["torchgco"]["commit"][:8] for start in starts))
     peer = f", CasADi {starts[0]['packages']['casadi']}" if "ipopt" in solver or "fatrop" in solver else ""
     card = {
