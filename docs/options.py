@@ -77,7 +77,7 @@ def _preset(name: str, kinds: dict[type, None]) -> str:
     rows = []
     for key in keys:
         kind = (plane.get(key) or space[key])[1]
-        values = [_shown(part[key][0]) if key in part else "-" for part in (plane, space)]
+        values = [_shown(keys_of[key][0]) if key in keys_of else "-" for keys_of in (plane, space)]
         rows.append(f"| `{key}` | {values[0]} | {values[1]} | {_link(kind)} |")
     return "\n".join([*lines, "| key | plane | space | class |", "|---|---|---|---|", *rows, ""])
 
@@ -109,21 +109,22 @@ def meanings_of(kind: type) -> dict[str, str]:
     """What the docstring of a class, or one that it refers to, says of each option."""
     text = inspect.cleandoc(kind.__doc__ or "")
     inside = re.search(r"^Args:\n((?: {4}.*\n?|\n)+)", text, re.MULTILINE)
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for names, words in ENTRY.findall(inside[1] if inside else ""):
         for name in names.split(", "):
-            found[name] = _resolved(name, " ".join(words.split()))
-    return found
+            texts[name] = _resolved(name, " ".join(words.split()))
+    return texts
 
 
 def _resolved(name: str, words: str) -> str:
     """The words of another class in the place of a reference to it."""
-    other = SAME.fullmatch(words)
-    if other is None:
+    reference = SAME.fullmatch(words)
+    if reference is None:
         return words
     kinds = {kind.__name__: kind for kind in _known()}
-    there = meanings_of(kinds[other[1]]).get(name, "") if other[1] in kinds else ""
-    return f"{there}{other[2]}" if there else words
+    kind, more = kinds.get(reference[1]), reference[2]
+    meaning = meanings_of(kind).get(name, "") if kind else ""
+    return f"{meaning}{more}" if meaning else words
 
 
 def _known() -> Iterator[type]:

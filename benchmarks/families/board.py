@@ -58,8 +58,8 @@ def fly(family: str, solvers: Sequence[str]) -> None:
     first, *others = solvers
     words = [*FAMILIES[family].overrides(), f"solver={first}", f"study.baselines=[{','.join(others)}]"]
     trials = flown(FLOWN / family, *words, "study.workers=1", "device.threads=1", "study.figures=false")
-    with np.load(FLOWN / family / "solutions.npz") as held:
-        for solver, U in zip(held["solver"].tolist(), held["U"], strict=True):
+    with np.load(FLOWN / family / "solutions.npz") as solutions:
+        for solver, U in zip(solutions["solver"].tolist(), solutions["U"], strict=True):
             seconds = trials.loc[trials["solver"] == solver].sort_values("layout")["seconds"].to_numpy()
             path = BOARD / "entries" / solver / f"{family}.npz"
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -80,8 +80,8 @@ class Scene:
 
 def usual_model(layouts: Layouts) -> str:
     """The built-in model that flies layouts; InputError where none has as many states."""
-    given = layouts.start if layouts.start is not None else layouts.goal
-    states = layouts.dimension if given is None else given.shape[1]
+    ends = layouts.start if layouts.start is not None else layouts.goal
+    states = layouts.dimension if ends is None else ends.shape[1]
     if states == layouts.dimension:
         return ANYWHERE[layouts.dimension]
     for name, space in BUILT_IN.items():
@@ -139,17 +139,16 @@ def _each(row: pd.Series) -> list[Cell]:
 
 def _cells(row: pd.Series, trials: pd.DataFrame) -> list[Cell]:
     """The cells of COLUMNS, from a row of a summary and the trials that it counts."""
-    own = trials[trials["solver"] == row["solver"]]
+    flights = trials[trials["solver"] == row["solver"]]
     shares = [Cell(rate(name)(row), float(row[f"{name}_rate"])) for name in ("success", "reached", "feasible")]
     median, most = row["cost_ratio_median"], row["cost_ratio_p90"]
     ratio = Cell("-" if np.isnan(median) else f"{median:.3f} ({most:.3f})", float(median))
-    least = own.loc[own["reached"].astype(bool), "clearance"].min()
-    return [*shares, ratio, _number(least, "{:.3f}"), _number(own["seconds"].median(), "{:.3g}")]
+    least = flights.loc[flights["reached"].astype(bool), "clearance"].min()
+    return [*shares, ratio, _number(least, "{:.3f}"), _number(flights["seconds"].median(), "{:.3g}")]
 
 
 def _number(value: Any, form: str) -> Cell:
-    known = not pd.isna(value)
-    return Cell(form.format(value) if known else "-", float(value) if known else np.nan)
+    return Cell("-", np.nan) if pd.isna(value) else Cell(form.format(value), float(value))
 
 
 def _text(value: Any) -> Cell:
@@ -189,18 +188,18 @@ def leaderboard(
     scenes = {path.stem: path for path in layouts_of(folder)}
     refused: dict[str, InputError] = {}
     entries, files = list[Entry](), dict[str, dict[str, Path]]()
-    for place in entries_of(folder):
+    for entry_folder in entries_of(folder):
         try:
-            entry = Entry.read(place)
+            entry = Entry.read(entry_folder)
             files[entry.id] = entry.files(list(scenes))
             entries.append(entry)
         except InputError as error:
-            refused[place.name] = error
+            refused[entry_folder.name] = error
     rows, table, cards = list[list[Cell]](), list[dict[str, Any]](), {entry.id: entry for entry in entries}
     for name, path in scenes.items():
         say(name)
-        own = {entry: held[name] for entry, held in files.items() if entry in cards and name in held}
-        trials = _judged(Scene.read(path, words, trust=trust), own, refused, trust)
+        entered = {entry: paths[name] for entry, paths in files.items() if entry in cards and name in paths}
+        trials = _judged(Scene.read(path, words, trust=trust), entered, refused, trust)
         for _, row in (trials if trials.empty else summarise(trials)).iterrows():
             entry = cards[row["solver"]]
             rows.append([_text(name), _text(entry.name), *_cells(row, trials), *_said(entry)])
@@ -216,16 +215,16 @@ def leaderboard(
 
 def _judged(scene: Scene, files: Mapping[str, Path], refused: dict[str, InputError], trust: bool) -> pd.DataFrame:
     """The rows of all entries on some layouts, by their folders' names; no rows where there are none."""
-    given = list[Controls]()
+    controls = list[Controls]()
     for entry, path in files.items():
         try:
-            controls = scene.controls(path, trust)
-            if len(controls) != 1:
-                raise InputError("CONTROLS", "those of one solver in a file of an entry", len(controls))
-            given.append(replace(controls[0], name=entry))
+            solvers = scene.controls(path, trust)
+            if len(solvers) != 1:
+                raise InputError("CONTROLS", "those of one solver in a file of an entry", len(solvers))
+            controls.append(replace(solvers[0], name=entry))
         except InputError as error:
             refused[f"{entry}/{path.name}"] = error
-    return scene.judged(given) if given else pd.DataFrame()
+    return scene.judged(controls) if controls else pd.DataFrame()
 
 
 SAID = {"hardware": "as the entrant says", "seeds": "as the entrant says", "date": "of the flights"}

@@ -74,11 +74,11 @@ class Form:
     def places(self, numbers: Sequence[Any] | np.ndarray, path: Path) -> np.ndarray:
         """The places of layouts by their numbers; InputError where one isn't among them."""
         order = np.argsort(self.ids)
-        found = np.searchsorted(self.ids, numbers, sorter=order).clip(max=self.L - 1)
-        places = order[found]
+        ranks = np.searchsorted(self.ids, numbers, sorter=order).clip(max=self.L - 1)
+        places = order[ranks]
         if (wrong := self.ids[places] != numbers).any():
-            known = ", ".join(map(str, self.ids[:8].tolist())) + (", ..." if self.L > 8 else "")
-            raise _wrong(path, f"layouts of the file, {known}", f"layout {np.asarray(numbers)[wrong][0]}")
+            first = ", ".join(map(str, self.ids[:8].tolist())) + (", ..." if self.L > 8 else "")
+            raise _wrong(path, f"layouts of the file, {first}", f"layout {np.asarray(numbers)[wrong][0]}")
         return places
 
     def controls(self, name: str, U: np.ndarray, lengths: np.ndarray | None, seconds: np.ndarray) -> Controls:
@@ -142,10 +142,10 @@ def _from_npz(path: Path, form: Form, trust: bool) -> list[Controls]:
     several = numbers["U"].ndim == 4
     names = [str(name) for name in np.atleast_1d(arrays.get("solver", np.array([path.stem])))]
     form.check_size(path, len(names), trust)
-    given = np.asarray(arrays.get("layout", form.ids))
-    if given.ndim != 1 or given.dtype.kind not in "iu" or len(np.unique(given)) < len(given):
-        raise _wrong(path, "layout: whole numbers (L,), each once", f"{given.dtype} {given.shape}")
-    places, lead = form.places(given, path), (*((len(names),) if several else ()), len(given))
+    ids = np.asarray(arrays.get("layout", form.ids))
+    if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(np.unique(ids)) < len(ids):
+        raise _wrong(path, "layout: whole numbers (L,), each once", f"{ids.dtype} {ids.shape}")
+    places, lead = form.places(ids, path), (*((len(names),) if several else ()), len(ids))
     shapes = {"U": (*lead, form.N, form.m), "times": (*lead, form.N + 1), "seconds": lead}
     for name, array in numbers.items():
         if array.shape != shapes[name]:
@@ -155,13 +155,13 @@ def _from_npz(path: Path, form: Form, trust: bool) -> list[Controls]:
     _check_times(path, form, "times" in numbers, "times")
     made = []
     for i, name in enumerate(names):
-        own = {key: array[i] if several else array for key, array in numbers.items()}
-        U, lengths, seconds = _empty(form, "times" in own)
-        U[places] = own["U"]
+        of_solver = {key: array[i] if several else array for key, array in numbers.items()}
+        U, lengths, seconds = _empty(form, "times" in of_solver)
+        U[places] = of_solver["U"]
         if lengths is not None:
-            lengths[places] = np.diff(own["times"], axis=1)
-        if "seconds" in own:
-            seconds[places] = own["seconds"]
+            lengths[places] = np.diff(of_solver["times"], axis=1)
+        if "seconds" in of_solver:
+            seconds[places] = of_solver["seconds"]
         made.append(form.controls(name, U, lengths, seconds))
     return made
 
@@ -172,8 +172,8 @@ def _numbers(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     return array.astype(np.float64)
 
 
-def _check_times(path: Path, form: Form, there: bool, name: str) -> None:
-    if there != form.free:
+def _check_times(path: Path, form: Form, timed: bool, name: str) -> None:
+    if timed != form.free:
         raise _wrong(path, f"{name}, as the time is free" if form.free else f"no {name}: the time is given", name)
 
 
@@ -193,21 +193,21 @@ def _from_csv(path: Path, form: Form, trust: bool) -> list[Controls]:
             table = pd.read_csv(path, compression=None, dtype={"solver": "string"}, skipinitialspace=True)
     except MemoryError:
         refuse(path, "a table that takes more", "CONTROLS")
-    known = [*KEYS, *heads, "solver", "seconds", "dt"]
+    names = [*KEYS, *heads, "solver", "seconds", "dt"]
     if missing := [name for name in (*KEYS, *heads) if name not in table.columns]:
         raise _wrong(path, f"columns {', '.join((*KEYS, *heads))}", f"none called {missing[0]}")
-    if unknown := [name for name in table.columns if name not in known]:
-        raise _wrong(path, f"columns among {', '.join(known)}", unknown[0])
+    if unknown := [name for name in table.columns if name not in names]:
+        raise _wrong(path, f"columns among {', '.join(names)}", unknown[0])
     _check_times(path, form, "dt" in table.columns, "dt")
     values = {name: _column(path, table, name) for name in table.columns if name != "solver"}
     places = form.places(_whole(path, "layout", values["layout"]), path)
     stages = _whole(path, "k", values["k"])
     if (outside := (stages < 0) | (stages >= form.N)).any():
         raise _wrong(path, f"k from 0 to {form.N - 1}", int(stages[outside][0]))
-    names = table["solver"].fillna("") if "solver" in table.columns else pd.Series([path.stem] * len(table))
-    form.check_size(path, names.nunique(), trust)
+    solvers = table["solver"].fillna("") if "solver" in table.columns else pd.Series([path.stem] * len(table))
+    form.check_size(path, solvers.nunique(), trust)
     made = []
-    for name, rows in names.groupby(names, sort=False).indices.items():
+    for name, rows in solvers.groupby(solvers, sort=False).indices.items():
         made.append(_of_rows(path, form, str(name), rows, places, stages, values))
     if not made:
         raise _wrong(path, "a row per stage", "no rows")
@@ -218,17 +218,17 @@ def _of_rows(
     path: Path, form: Form, name: str, rows: np.ndarray, places: np.ndarray, stages: np.ndarray, values: Mapping
 ) -> Controls:
     """The controls of one solver from its rows of a table."""
-    at = places[rows], stages[rows]
-    flat, times_found = np.unique(at[0] * form.N + at[1], return_counts=True)
-    if (repeated := flat[times_found > 1]).size:
+    layout_places, of_rows = places[rows], stages[rows]
+    flat, counts = np.unique(layout_places * form.N + of_rows, return_counts=True)
+    if (repeated := flat[counts > 1]).size:
         where = f"two for layout {form.ids[repeated[0] // form.N]}, k {repeated[0] % form.N}"
         raise _wrong(path, "one row per stage", where)
     U, lengths, seconds = _empty(form, "dt" in values)
-    U[at] = np.stack([values[f"u{i + 1}"][rows] for i in range(form.m)], axis=-1)
+    U[layout_places, of_rows] = np.stack([values[f"u{i + 1}"][rows] for i in range(form.m)], axis=-1)
     if lengths is not None:
-        lengths[at] = values["dt"][rows]
+        lengths[layout_places, of_rows] = values["dt"][rows]
     if "seconds" in values:
-        seconds[at[0]] = values["seconds"][rows]
+        seconds[layout_places] = values["seconds"][rows]
     return form.controls(name, U, lengths, seconds)
 
 

@@ -55,13 +55,13 @@ class Entry:
     def read(cls, folder: Path) -> Entry:
         """The entry in a folder; InputError where its card is missing, unreadable or lacks a text."""
         path = folder / CARD
-        known = {field.name: field for field in fields(cls) if field.name != "folder"}
+        card = {field.name: field for field in fields(cls) if field.name != "folder"}
         values = {key: _text(path, key, value) for key, value in _toml(path).items()}
         for key in values:
-            if key not in known:
-                near = get_close_matches(key, known, n=1) or [", ".join(known)]
+            if key not in card:
+                near = get_close_matches(key, card, n=1) or [", ".join(card)]
                 raise InputError(str(path), f"a key of a card, such as {near[0]}", key)
-        for key, field in known.items():
+        for key, field in card.items():
             if field.default != "" and not values.get(key):
                 raise InputError(str(path), f"a text for {key}", "none")
         if (link := values.get("link", "")) and not link.startswith(("https://", "http://")):
@@ -74,17 +74,17 @@ class Entry:
         Raises:
             InputError: none, two for the same layouts, or one of no layouts of the board.
         """
-        found: dict[str, Path] = {}
+        paths: dict[str, Path] = {}
         for path in sorted(self.folder.iterdir()):
             if path.suffix.lower() in ENDINGS:
                 if path.stem not in layouts:
                     raise InputError(str(path), f"the name of layouts: {', '.join(layouts)}", path.stem)
-                if path.stem in found:
-                    raise InputError(str(path), "one file for the same layouts", f"{found[path.stem].name}, too")
-                found[path.stem] = path
-        if not found:
+                if path.stem in paths:
+                    raise InputError(str(path), "one file for the same layouts", f"{paths[path.stem].name}, too")
+                paths[path.stem] = path
+        if not paths:
             raise InputError(str(self.folder), f"controls, such as {layouts[0]}.npz", "none")
-        return found
+        return paths
 
 
 def entries_of(folder: Path) -> Iterator[Path]:
@@ -94,18 +94,18 @@ def entries_of(folder: Path) -> Iterator[Path]:
         InputError: there is no such folder, or none in it.
     """
     inside = folder / ENTRIES
-    found = sorted(path for path in inside.iterdir() if path.is_dir()) if inside.is_dir() else []
-    if not found:
+    folders = sorted(path for path in inside.iterdir() if path.is_dir()) if inside.is_dir() else []
+    if not folders:
         raise InputError("--board", f"a folder with entries in {ENTRIES}, each with its {CARD}", folder)
-    yield from found
+    yield from folders
 
 
 def layouts_of(folder: Path) -> list[Path]:
     """The files of layouts, by name; InputError where there is none."""
-    found = sorted((folder / LAYOUTS).glob("*.npz"))
-    if not found:
+    files = sorted((folder / LAYOUTS).glob("*.npz"))
+    if not files:
         raise InputError("--board", f"a folder with layouts in {LAYOUTS}, such as forest.npz", folder)
-    return found
+    return files
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -35,7 +35,7 @@ def judge_files(
         InputError: as `Scene.read` and `read_controls`, or solvers of the same name.
     """
     scene = Scene.read(layouts, words, best, trust)
-    trials = scene.judged([given for path in controls for given in scene.controls(path, trust)])
+    trials = scene.judged([solver for path in controls for solver in scene.controls(path, trust)])
     trials.attrs[MERGED] = [str(path) for path in controls]  # reports read it where its own folder is named
     return trials
 

@@ -44,13 +44,13 @@ def judged(
     Raises:
         InputError: layouts that don't fit the vehicle, or a solver's name that is given twice.
     """
-    names = [given.name for given in controls]
+    names = [solver.name for solver in controls]
     for name in names:
         if names.count(name) > 1:
             raise InputError("CONTROLS", "another name for each solver (the file's, or its `solver`)", f"{name} twice")
     tasks = [(places, vehicle.task(layouts.take(places))) for places in layouts.together(AT_ONCE)]
-    parts = [_rows(task, given, places) for given in controls for places, task in tasks]
-    rows = pd.concat(parts, ignore_index=True)
+    tables = [_rows(task, solver, places) for solver in controls for places, task in tasks]
+    rows = pd.concat(tables, ignore_index=True)
     digests = layout_digests(vehicle.at_rest(layouts), model)
     rows = rows.assign(
         scenario=layouts.name, seed=seed, model=vehicle.name, layout_digest=rows["layout"].map(digests), **UNKNOWN
@@ -62,25 +62,25 @@ def judged(
     return rows[[*COLUMNS, *(name for name in rows.columns if name not in COLUMNS)]]
 
 
-def _rows(task: Task, given: Controls, places: np.ndarray) -> pd.DataFrame:
+def _rows(task: Task, solver: Controls, places: np.ndarray) -> pd.DataFrame:
     """The rows of one solver on layouts that a batch can hold."""
     problem = task.problem
-    U = torch.from_numpy(given.U[places, : problem.N])
-    times = times_at(given.times, places, problem.N)
+    U = torch.from_numpy(solver.U[places, : problem.N])
+    times = times_at(solver.times, places, problem.N)
     if times is not None:  # of a layout that is lacking the times are, too
         times = torch.where(times.isfinite().all(-1, keepdim=True), times, _usual(task))
     verdict = judge(problem, U, task.goal, task.goal_radius, times=times)
     X = states_of(problem, U, times)
     certificate = certify(problem, X, U, verdict.feasible, times=times)
-    lacking, stages = given.lacking[places], problem.stages.numpy()
+    lacking, stages = solver.lacking[places], problem.stages.numpy()
     finite = torch.isfinite(X).flatten(1).all(-1).numpy()
     status = np.where(verdict.feasible.numpy(), "FEASIBLE", np.where(finite, "INFEASIBLE", "NON_FINITE"))
     status = np.where(lacking >= stages, ABSENT, np.where(lacking > 0, INCOMPLETE, status))
     return pd.DataFrame(
         {
-            "layout": task.layouts.ids, "solver": given.name, "status": status, **frame_columns(verdict),
+            "layout": task.layouts.ids, "solver": solver.name, "status": status, **frame_columns(verdict),
             **durations(times), **gates_passed(problem, verdict), **certificate_columns(certificate),
-            "seconds": given.seconds[places], "settings_digest": given.digest,
+            "seconds": solver.seconds[places], "settings_digest": solver.digest,
         }
     )  # fmt: skip
 

@@ -28,7 +28,7 @@ from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TR
 from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
-from torchgco.experiments.statistics.power import told
+from torchgco.experiments.statistics.power import in_words
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
@@ -174,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     if options.power is not None:
-        say(told(*options.power))
+        say(in_words(*options.power))
         return 0
     if not options.folders:
         raise InputError("DIR", "a study, or a folder of studies", "none")

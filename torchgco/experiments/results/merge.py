@@ -136,11 +136,10 @@ def _unswept(run: Run) -> pd.DataFrame:
 
 def _options(rows: pd.DataFrame, settings: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """The columns of swept options of solvers, for all rows whose settings are known, by digest."""
-    known, columns = {code: flat(solver) for code, solver in settings.items()}, dict[str, Any]()
+    options, columns = {code: flat(solver) for code, solver in settings.items()}, dict[str, Any]()
     for name in (name for name in swept_columns(rows) if name.startswith(OPTION)):
-        own = zip(rows["settings_digest"], rows[name], strict=True)
-        key = name.removeprefix(OPTION)
-        columns[name] = column([known[code].get(key, pd.NA) if code in known else value for code, value in own])
+        pairs, key = zip(rows["settings_digest"], rows[name], strict=True), name.removeprefix(OPTION)
+        columns[name] = column([options[code].get(key, pd.NA) if code in options else cell for code, cell in pairs])
     return columns
 
 

@@ -7,7 +7,7 @@ from difflib import get_close_matches
 import pandas as pd
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.results.kinds import MISSIONS, parts_of
+from torchgco.experiments.results.kinds import parts_of
 from torchgco.experiments.statistics.missions import MEANS, MEDIANS
 from torchgco.experiments.statistics.statistics import EFFORT, OUTCOMES, PAPER_OUTCOME
 from torchgco.missions.outcome import Outcome
@@ -26,10 +26,10 @@ def check_objective(name: object, missions: bool) -> None:
     Raises:
         InputError: it has none.
     """
-    known = OF_MISSIONS if missions else OF_TRAJECTORIES
-    if name not in known:
-        near = get_close_matches(str(name), known, n=1)
-        expected = f"a number of the summary, such as {', '.join(near or known[:2])}"
+    names = OF_MISSIONS if missions else OF_TRAJECTORIES
+    if name not in names:
+        near = get_close_matches(str(name), names, n=1)
+        expected = f"a number of the summary, such as {', '.join(near or names[:2])}"
         raise InputError("study.objective", expected, name)
 
 
@@ -39,9 +39,7 @@ def objective_of(trials: pd.DataFrame, name: str, solver: str) -> float:
     Raises:
         InputError: it isn't defined for these trials, as success is without a best cost.
     """
-    part = parts_of(trials)[0]
-    assert part.kind is MISSIONS or name in OF_TRAJECTORIES
-    value = float(part.summary.set_index("solver")[name][solver])
+    value = float(parts_of(trials)[0].summary.set_index("solver")[name][solver])
     if value != value:
         raise InputError("study.objective", "a number that these trials define", f"{name}, which is undefined")
     return value

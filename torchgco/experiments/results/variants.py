@@ -101,17 +101,16 @@ def values_of(rows: pd.DataFrame, manifest: Manifest, keys: Sequence[str]) -> di
     for key in keys:
         if key in shared:
             columns[key] = column([shared[key]] * len(rows))
-        elif key.startswith(OPTION) and any(key.removeprefix(OPTION) in held for held in options.values()):
-            values = {name: held.get(key.removeprefix(OPTION), pd.NA) for name, held in options.items()}
+        elif key.startswith(OPTION) and any(key.removeprefix(OPTION) in settings for settings in options.values()):
+            values = {name: settings.get(key.removeprefix(OPTION), pd.NA) for name, settings in options.items()}
             columns[key] = column([values[name] for name in rows["solver"]])
     return columns
 
 
 def column(values: Sequence[Any]) -> Any:
     """Values of a key as an array: numbers where all are, else texts; NA where there is none."""
-    there = [value is not pd.NA for value in values]
-    kind = _kind([value for value, known in zip(values, there, strict=True) if known])
-    return pd.array([_cell(value, known, kind) for value, known in zip(values, there, strict=True)], dtype=kind)
+    kind = _kind([value for value in values if value is not pd.NA])
+    return pd.array([_cell(value, value is not pd.NA, kind) for value in values], dtype=kind)
 
 
 def _clusters(

@@ -61,7 +61,7 @@ def layouts_needed(a: float, b: float, nested: bool, wanted: float = POWER) -> i
     return many
 
 
-def told(a: float, b: float) -> str:
+def in_words(a: float, b: float) -> str:
     """The numbers in words."""
     least, most = (layouts_needed(a, b, nested) for nested in (True, False))
     return (
