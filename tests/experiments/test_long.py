@@ -129,3 +129,21 @@ def test_reading_loads_neither_hydra_nor_matplotlib() -> None:
     code = "import sys, torchgco; torchgco.read; print([m for m in ('hydra', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[]"]
+
+
+# Names that other programs read: files, columns in their order, arrays.
+NAMES = [
+    "scenario", "layout", "seed", "model", "solver", "status", "feasible", "reached", "success", "cost", "best_cost",
+    "violation", "clearance", "clearance_knots", "goal_distance", "iterations", "outer_iterations", "guided", "seconds",
+    "batch_size", "threads", "device", "dtype", "version",
+]  # fmt: skip
+FILES = {"trials.parquet", "summary.csv", "layouts.npz", "solutions.npz", ".hydra"}
+
+
+def test_a_sweep_keeps_the_names_of_before(swept: Path) -> None:
+    for table, path in zip(tables(swept), sorted(swept.glob("*/trials.parquet")), strict=True):
+        assert [name for name in table.columns if name in NAMES] == NAMES
+        assert {file.name for file in path.parent.iterdir()} >= FILES
+        with np.load(path.parent / "solutions.npz", allow_pickle=False) as arrays:
+            assert arrays["U"].shape == (2, 2, 5, 4) and arrays["solver"].tolist() == ["ilqr", "hold"]
+            assert arrays["layout"].tolist() == [0, 1]

@@ -16,7 +16,7 @@ import torch
 import torchgco
 from tests.bombs import zipped
 from torchgco import InputError, Layouts
-from torchgco.experiments.referee.board import Scene
+from torchgco.experiments.referee.board import Scene, judged_page
 from torchgco.experiments.referee.judge import judge_files
 from torchgco.scenarios import concatenate
 
@@ -142,6 +142,11 @@ def test_a_free_time_needs_the_times_of_knots(path: Path, U: np.ndarray, tmp_pat
     one, other = (judge_files(file, [tmp_path / name]) for name in ("timed.npz", "timed too.csv"))
     np.testing.assert_allclose(one["duration"], N * dt)
     np.testing.assert_allclose(one["cost"], other["cost"], rtol=1e-12)
+    late = np.tile(np.arange(N + 1) * dt, (COUNT, 1))
+    late[0], late[1, 7], late[2] = np.nan, np.nan, -late[2]
+    np.savez(tmp_path / "late.npz", U=U, times=late)
+    trials = judge_files(file, [tmp_path / "late.npz"])
+    assert trials["status"].tolist() == ["ABSENT", "INCOMPLETE", "INFEASIBLE"] and not trials["feasible"].any()
     np.savez(tmp_path / "bare.npz", U=U)
     with pytest.raises(InputError, match="times, as the time is free"):
         judge_files(file, [tmp_path / "bare.npz"])
@@ -185,6 +190,8 @@ WRONG: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "twice": ("x.npz", lambda file: np.savez(file, U=np.zeros((2, N, M)), layout=[1, 1]), "each once"),
     "fractions": ("x.npz", lambda file: np.savez(file, U=np.zeros((1, N, M)), layout=[0.5]), "whole numbers"),
     "no name": ("x.npz", lambda file: np.savez(file, U=np.zeros((3, N, M)), solver=" "), "of 1 to 64 letters"),
+    "negative time": ("x.npz", lambda file: np.savez(file, U=np.zeros((3, N, M)), seconds=[0, -1, 1]), "got -1 of x"),
+    "no time": ("x.npz", lambda file: np.savez(file, U=np.zeros((3, N, M)), seconds=[0, np.inf, 1]), "got inf of x"),
     "empty": ("x.csv", lambda file: file.write_text(""), "a readable npz file without pickles, or a CSV file"),
     "heads alone": ("x.csv", lambda file: file.write_text("layout,k,u1,u2\n"), "a row per stage, got no rows"),
     "no column": ("x.csv", lambda file: file.write_text("layout,k,u1\n0,0,1\n"), "none called u2"),
@@ -222,6 +229,16 @@ def test_two_solvers_of_one_name_are_refused(path: Path, U: np.ndarray, tmp_path
         np.savez(tmp_path / folder / "mine.npz", U=U)
     with pytest.raises(InputError, match="another name for each solver"):
         judge_files(path, [tmp_path / "a" / "mine.npz", tmp_path / "b" / "mine.npz"])
+
+
+def test_extreme_controls_fail_alone(path: Path, U: np.ndarray, tmp_path: Path) -> None:
+    extreme = U.copy()
+    extreme[0], extreme[1] = 1e300, -1e-320
+    np.savez(tmp_path / "extreme.npz", U=extreme)
+    np.savez(tmp_path / "all.npz", U=U)
+    trials, whole = (judge_files(path, [tmp_path / name]) for name in ("extreme.npz", "all.npz"))
+    assert not trials["feasible"][0] and trials["feasible"][1] and not trials["reached"][:2].any()
+    assert trials[JUDGED].iloc[2].equals(whole[JUDGED].iloc[2]) and "INFEASIBLE" in judged_page(trials)
 
 
 def test_layouts_that_are_numbered_otherwise(path: Path, U: np.ndarray, tmp_path: Path) -> None:

@@ -84,12 +84,16 @@ class Form:
     def controls(self, name: str, U: np.ndarray, lengths: np.ndarray | None, seconds: np.ndarray) -> Controls:
         """Controls from arrays of all layouts, NaN where nothing is given; at rest beyond the stages of each."""
         beyond = np.arange(self.N) >= self.stages[:, None]
+        if lengths is not None:  # a stage without its length is missing
+            U = np.where(np.isnan(lengths)[..., None], np.nan, U)
         U = np.where(beyond[..., None], self.rest, U)
         lacking = (np.isnan(U).all(-1) & ~beyond).sum(1)
         times = None
         if lengths is not None:
             lengths = np.where(beyond, 0.0, lengths)
             times = np.concatenate((np.zeros((self.L, 1)), np.cumsum(lengths, axis=1)), axis=1)
+        if (wrong := (seconds < 0) | np.isinf(seconds)).any():
+            raise InputError("CONTROLS", "seconds of at least 0, NaN where unknown", f"{seconds[wrong][0]:g} of {name}")
         name = " ".join(name.split())
         if not name or len(name) > NAME_LETTERS:
             raise InputError("CONTROLS", f"a solver's name of 1 to {NAME_LETTERS} letters", shown(name))
