@@ -28,13 +28,18 @@ METHODS = {
     "ipopt": "IPOPT with MUMPS through CasADi: multiple shooting, exact Hessians, from the vehicle at rest.",
     "fatrop": "FATROP through CasADi: multiple shooting, exact Hessians, from the vehicle at rest.",
     "fatrop_guided": "FATROP from the cheapest of four paths of torchgco's roadmap; finding them counts.",
+    "gco_paper": "AL-iLQR guided by MPPI samples: Algorithms 1 to 5 of Kawarabayashi, Uchiyama and Masuda (2026).",
 }
-NAMES = {"interior_point": "interior point", "ipopt": "IPOPT", "fatrop": "FATROP", "fatrop_guided": "FATROP, guided"}
+TOGETHER = ("gco", "interior_point", "ipopt", "fatrop", "fatrop_guided")  # flown by one study; others by their own
+NAMES = {
+    "interior_point": "interior point", "ipopt": "IPOPT", "fatrop": "FATROP", "fatrop_guided": "FATROP, guided",
+    "gco_paper": "the paper's method",
+}  # fmt: skip
 
 
 def enter(solver: str, families: Sequence[str]) -> None:
     """Write the card of a solver, from the records of its flights."""
-    records = [json.loads((FLOWN / family / "run.json").read_text()) for family in families]
+    records = [json.loads((folder_of(family, solver) / "run.json").read_text()) for family in families]
     starts = [max(record, key=lambda start: start["processor_seconds"] or 0.0) for record in records]  # that flew
     commits = ", ".join(dict.fromkeys(start["torchgco"]["commit"][:8] for start in starts))
     peer = f", CasADi {starts[0]['packages']['casadi']}" if "ipopt" in solver or "fatrop" in solver else ""
@@ -53,12 +58,16 @@ def enter(solver: str, families: Sequence[str]) -> None:
     (folder / "entry.toml").write_text(text)
 
 
-def fly(family: str, solvers: Sequence[str]) -> None:
-    """Fly a family with all solvers, one after the other, and write their files of controls."""
-    first, *others = solvers
+def folder_of(family: str, solver: str) -> Path:
+    return FLOWN / (family if solver in TOGETHER else f"{family}-{solver}")
+
+
+def fly(family: str, first: str, *others: str) -> None:
+    """Fly a family with solvers of one study, one after the other, and write their files of controls."""
     words = [*FAMILIES[family].overrides(), f"solver={first}", f"study.baselines=[{','.join(others)}]"]
-    trials = flown(FLOWN / family, *words, "study.workers=1", "device.threads=1", "study.figures=false")
-    with np.load(FLOWN / family / "solutions.npz") as solutions:
+    folder = folder_of(family, first)
+    trials = flown(folder, *words, "study.workers=1", "device.threads=1", "study.figures=false")
+    with np.load(folder / "solutions.npz") as solutions:
         for solver, U in zip(solutions["solver"].tolist(), solutions["U"], strict=True):
             seconds = trials.loc[trials["solver"] == solver].sort_values("layout")["seconds"].to_numpy()
             path = BOARD / "entries" / solver / f"{family}.npz"
@@ -68,8 +77,11 @@ def fly(family: str, solvers: Sequence[str]) -> None:
 
 def text(families: Sequence[str], solvers: Sequence[str]) -> str:
     """Fly, enter, judge; returns the table of the leaderboard."""
+    studies = [[name for name in solvers if name in TOGETHER], *([name] for name in solvers if name not in TOGETHER)]
     for family in families:
-        fly(family, solvers)
+        for names in studies:
+            if names:
+                fly(family, *names)
     for solver in solvers:
         enter(solver, families)
     judge(["--board", str(BOARD)])
