@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from html import escape
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,7 +24,7 @@ def test_its_page_and_table_have_all_entries_on_all_layouts() -> None:
     assert len(board) == sum(len(entry.files(names)) for entry in entries)
     assert html.count("<tr><td>") == len(board) + len(entries)
     for entry in entries:
-        assert f"<td>{entry.name}</td>" in html and entry.method and "at " in entry.version
+        assert f"<td>{escape(entry.name)}</td>" in html and entry.method and "at " in entry.version
     lines = table(BOARD / "board.csv").splitlines()
     assert len(lines) == len(board) + 2 and lines[2].startswith("| forest30 | ")
 
