@@ -42,36 +42,78 @@ def root(residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
 
     By Newton's method with corrections that are halved until the residual is less (Nocedal and Wright, Numerical
     Optimization, section 11.2). Its first and second derivatives by all that the residual reads are those of the
-    implicit function.
+    implicit function. Roots that the residual itself asks for, of as many rows, are found together with it.
     """
     if _AS_OPERATIONS.get():
         unknown = torch.ops.torchgco.unknown(guess)
         return torch.ops.torchgco.solved(unknown, residual(unknown))
-    z = _newton(residual, guess.detach())
-    inverse = torch.linalg.inv_ex(_slopes(residual, z))[0]
+    if (around := _AROUND.get()) is not None and around.rows == guess.shape[:-1]:
+        return around.root_within(residual, guess)
+    equation = _Equation(residual, guess)
+    z = _newton(equation, equation.guess)
+    inverse = torch.linalg.inv_ex(_slopes(equation, z))[0]
     # A step of Newton's method with a constant inverse brings one more derivative each.
     for _ in range(2):
-        z = z - (inverse @ residual(z).unsqueeze(-1)).squeeze(-1)
-    return z
+        z = z - (inverse @ equation(z).unsqueeze(-1)).squeeze(-1)
+    return z[..., : guess.shape[-1]]
+
+
+class _Equation:
+    """A residual together with those of the roots that it asks for, as a function of all unknowns (..., q)."""
+
+    def __init__(self, residual: Callable[[Tensor], Tensor], guess: Tensor) -> None:
+        self._residual, self.rows = residual, guess.shape[:-1]
+        self._guesses, self._given = [guess.detach()], iter(list[Tensor]())
+        self._within: list[Tensor] = []
+        self._called(guess.detach())
+        self.guess, self._sizes = torch.cat(self._guesses, -1), [guess.shape[-1] for guess in self._guesses]
+
+    def __call__(self, z: Tensor) -> Tensor:
+        first, *others = z.split(self._sizes, -1)
+        self._given, self._within = iter(others), []
+        return torch.cat([self._called(first), *self._within], -1)
+
+    def _called(self, z: Tensor) -> Tensor:
+        before = _AROUND.set(self)
+        try:
+            return self._residual(z)
+        finally:
+            _AROUND.reset(before)
+
+    def root_within(self, residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
+        """The unknowns of a root that the residual asks for, as they are given; at first, its guess."""
+        z = next(self._given, None)
+        if z is None:
+            z = guess.detach()
+            self._guesses.append(z)
+        self._within.append(residual(z))
+        return z
+
+
+_AROUND: ContextVar[_Equation | None] = ContextVar("around", default=None)
 
 
 def _newton(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
     """The root without derivatives."""
-    near = torch.finfo(z.dtype).eps ** NEARLY_CONVERGED
+    epsilon = torch.finfo(z.dtype).eps
     size = torch.full_like(z[..., 0], torch.inf)
     correction, share, done = torch.zeros_like(z), torch.ones_like(size), torch.zeros_like(size, dtype=torch.bool)
     for _ in range(MOST_EVALUATIONS):
         trial = z + share.unsqueeze(-1) * correction
         rest = residual(trial).detach()
-        new_size = rest.square().sum(-1)
+        new_size, of_trial = rest.square().sum(-1), trial.abs().amax(-1)
         better = (new_size < size) & ~done
+        # The next correction is less than rounding, if it is to this residual as the last one was to the one before.
+        next_size = new_size * correction.abs().amax(-1).square()
+        exact = better & (size < torch.inf) & (next_size <= (epsilon * of_trial).square() * size)
         ahead = -torch.linalg.solve_ex(_slopes(residual, trial), rest)[0]
         accepted = better.unsqueeze(-1)
         z, correction = torch.where(accepted, trial, z), torch.where(accepted, ahead, correction)
         size, share = torch.where(better, new_size, size), torch.where(better, 1.0, 0.5 * share)
-        ends = (correction.abs().amax(-1) <= near * z.abs().amax(-1)) & (size < torch.inf) & ~done
+        near = correction.abs().amax(-1) <= epsilon**NEARLY_CONVERGED * of_trial
+        ends = better & ~exact & near
         z = torch.where(ends.unsqueeze(-1), z + correction, z)
-        done = done | ends
+        done = done | exact | ends
         if _all(done):
             break
     return torch.where(done.unsqueeze(-1), z, torch.nan)

@@ -41,10 +41,10 @@ def implicit(weights: Sequence[Sequence[float]]) -> Callable[[Rates, Tensor, flo
 
     def step(rates: Rates, x: Tensor, dt: float) -> Tensor:
         def residual(stages: Tensor) -> Tensor:
-            at = stages.chunk(len(weights), dim=-1)
-            slopes = [rates(stage) for stage in at]
-            ahead = (sum(w * slope for w, slope in zip(row, slopes, strict=True)) for row in weights)
-            return torch.cat([stage - torch.add(x, moved, alpha=dt) for stage, moved in zip(at, ahead, strict=True)], -1)
+            each = stages.chunk(len(weights), dim=-1)
+            slopes = [rates(stage) for stage in each]
+            ways = (sum(w * slope for w, slope in zip(row, slopes, strict=True)) for row in weights)
+            return torch.cat([stage - torch.add(x, way, alpha=dt) for stage, way in zip(each, ways, strict=True)], -1)
 
         return root(residual, torch.cat([x] * len(weights), -1))[..., -x.shape[-1] :]
 

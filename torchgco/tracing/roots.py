@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,16 +40,11 @@ class Roots:
     def __contains__(self, operation: Operation) -> bool:
         return id(operation) in self._operations
 
-    def take(
-        self, operation: Operation, known: dict[Slot, Any], guesses: dict[Slot, np.ndarray], calls: list[Call]
-    ) -> None:
+    def take(self, operation: Operation, known: dict[Slot, Any], equations: Equations, calls: list[Call]) -> None:
         """Add an unknown's symbols to `known`, or an equation's calls to `calls`, one a row.
 
-        Args:
-            guesses: of unknowns whose equations come later.
-
         Raises:
-            NoCounterpart: an equation that reads the unknowns of another one.
+            NoCounterpart: an equation within another one with other rows.
         """
         import casadi as ca
 
@@ -57,12 +52,28 @@ class Roots:
         if self._operations[id(operation)] == UNKNOWN:
             guess = boxed(known[first])
             symbol = np.frompyfunc(lambda i: ca.SX.sym(f"z{i}"), 1, 1)
-            guesses[made], known[made] = guess, symbol(np.arange(guess.size)).reshape(guess.shape)
+            equations.guesses[made], known[made] = guess, symbol(np.arange(guess.size)).reshape(guess.shape)
             return
-        guess, unknown, residual = guesses.pop(first), known[first], boxed(known[rest[0]])
-        if guesses:
-            raise NoCounterpart("an equation that reads the unknowns of another one")
-        size = guess.shape[-1]
-        for z, r, start in zip(*(a.reshape(-1, size) for a in (unknown, residual, guess)), strict=True):
-            calls.append(Call(Root(size), ca.densify(ca.SX(ca.vertcat(*r, *start))), ca.vertcat(*z)))
-        known[made] = unknown
+        guess, known[made] = equations.guesses.pop(first), known[first]
+        equations.closed.append((known[first], boxed(known[rest[0]]), guess))
+        if equations.guesses:
+            return  # it is within another one, whose unknowns are found together with its own
+        if len({unknown.shape[:-1] for unknown, *_ in equations.closed}) > 1:
+            raise NoCounterpart("an equation within another one that has other rows")
+        unknown, residual, guess = (
+            np.concatenate(arrays, axis=-1).reshape(-1, sum(a.shape[-1] for a in arrays))
+            for arrays in zip(*equations.closed, strict=True)
+        )
+        equations.closed.clear()
+        for z, r, start in zip(unknown, residual, guess, strict=True):
+            calls.append(Call(Root(len(z)), ca.densify(ca.SX(ca.vertcat(*r, *start))), ca.vertcat(*z)))
+
+
+@dataclass
+class Equations:
+    """Where a replay is: the guesses of unknowns whose equations are still to come, and equations, (unknowns, residual,
+    guess) each, within the one that is.
+    """
+
+    guesses: dict[Slot, np.ndarray] = field(default_factory=dict)
+    closed: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)

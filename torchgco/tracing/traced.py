@@ -24,10 +24,10 @@ from torchgco.tracing.arrays import NoCounterpart, boxed
 from torchgco.tracing.dtypes import replay
 from torchgco.tracing.fingerprint import fingerprint
 from torchgco.tracing.nets import MOST_WEIGHTS, Call, Nets
-from torchgco.tracing.roots import Roots
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.picks import followers, indices, needed, picks_of
 from torchgco.tracing.recorder import Operation, Recording, Slot, name_of, record, replay_all
+from torchgco.tracing.roots import Equations, Roots
 
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
@@ -312,13 +312,13 @@ class Traced:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         if calls is None:
             known |= self._weights
-        guesses: dict[Slot, np.ndarray] = {}
+        equations = Equations()
         for net, operation in self._nets.steps(self._symbolic, calls is not None):
             try:
                 if net is not None and calls is not None:
                     self._nets.call(net, known, len(self.pattern), self._precision, calls)
                 elif calls is not None and operation in self._roots:
-                    self._roots.take(operation, known, guesses, calls)
+                    self._roots.take(operation, known, equations, calls)
                 else:
                     replay(operation, known, self._precision)
             except NoCounterpart as error:

@@ -15,7 +15,7 @@ from torchgco.tracing.nets import Call
 
 
 class Newton:
-    """The unknowns of an equation; `derived`: and the inverse of A, for the stages that follow."""
+    """The unknowns of an equation; `derived`: and A, factored, for the stages that follow."""
 
     ahead: ClassVar[int | None] = None
 
@@ -31,7 +31,7 @@ class Newton:
     @property
     def kept_bytes(self) -> int:
         """What it takes on the stack, of eight problems side by side."""
-        return 8 * 8 * self._size * (2 * self._size + 3)
+        return 8 * 8 * self._size * (2 * self._size + 4)
 
     def helpers(self, name: str, symbols: Sequence[Any]) -> list[str]:
         equation = emit.function(f"{name}_equation", [*symbols, self.outputs], self._residual, self._slopes)
@@ -41,14 +41,15 @@ class Newton:
         q = self._size
         lines = [
             f"V b{i}[{q}], trial{i}[{q}], correction{i}[{q}], r{i}[{q}], A{i}[{q * q}];",
+            f"I turns{i}[{q * q}];",
             f"{name}_guess({passed}, trial{i});",
             f"newton_state newton{i} = newton_begin({q}, trial{i}, b{i}, correction{i});",
             f"do {name}_equation({passed}, trial{i}, r{i}, A{i});",
-            f"while (newton_next(&newton{i}, {q}, b{i}, trial{i}, correction{i}, r{i}, A{i}));",
+            f"while (newton_next(&newton{i}, {q}, b{i}, trial{i}, correction{i}, r{i}, A{i}, turns{i}));",
         ]
         if self._derived:
             lines.append(f"{name}_equation({passed}, b{i}, r{i}, A{i});")
-            lines += [f"V inverse{i}[{q * q}];", f"newton_invert({q}, A{i}, inverse{i});"]
+            lines.append(f"newton_factor({q}, A{i}, turns{i});")
         return lines
 
 
@@ -70,7 +71,7 @@ class _Solved:
 
     def lines(self, name: str, i: int, passed: str) -> list[str]:
         count, q = self.inputs.numel(), self._size
-        solve = f"{self.function}({q}, {count // q}, inverse{self.ahead}, a{i}, b{i});"
+        solve = f"{self.function}({q}, {count // q}, A{self.ahead}, turns{self.ahead}, a{i}, b{i});"
         return [f"V a{i}[{max(1, count)}], b{i}[{max(1, count)}];", f"{name}({passed}, a{i});", solve]
 
 
