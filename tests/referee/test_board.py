@@ -14,6 +14,7 @@ import pytest
 import torchgco
 from tests.referee.boards import CARD, DATA, HOSTILE, SHAPES, board, enter
 from torchgco import Layouts
+from torchgco.experiments.referee import board as board_module
 from torchgco.experiments.referee.board import Scene, leaderboard
 from torchgco.experiments.referee.judge import main
 from torchgco.experiments.referee.page import Board, Cell, page
@@ -75,6 +76,14 @@ def test_the_command_writes_tables_and_a_page(layouts: Path, tmp_path: Path, cap
     assert texts.count("best & <b>") == 3 and texts.count("ABSENT") == 0 and "0.5" in texts
     assert main([str(layouts), files[1], "--format", "csv", "--output", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.splitlines()[1].startswith("trajectory,planar_trap,planar,rest,2,")
+
+
+def test_a_page_of_many_layouts_shows_the_first(layouts: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(board_module, "SHOWN", 3)
+    np.savez(tmp_path / "two.npz", U=np.zeros((2, *SHAPES["planar_trap"])), solver=["a", "b"])
+    assert main([str(layouts), str(tmp_path / "two.npz")]) == 0
+    html = (tmp_path / "judged" / "judged.html").read_text()
+    assert "The first 3 of 4 rows of trials.parquet" in html and html.count("<tr><td>") == 2 + 3
 
 
 def test_best_costs_of_another_file(layouts: Path, tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ NOTES = (
     "success: reached at no more than 5 % above the best known cost. clearance: the smallest distance to contact, "
     "between the knots, too, of those that reached. Seconds, hardware and seeds are what entrants say.",
 )
+SHOWN = 10_000  # rows of single layouts on a page, at most: some 4 MB
 COLUMNS: dict[str, str] = {
     "success": "reached at no more than 5 % above the best known cost",
     "reached": "feasible, and within the goal's radius at the end",
@@ -110,8 +111,11 @@ def judged_page(trials: pd.DataFrame) -> str:
     rows = [[Cell(str(row["solver"])), *_cells(row, trials)] for _, row in summary.iterrows()]
     heads = [("solver", "as its file names it"), *COLUMNS.items()]
     every = [("solver", "as its file names it"), ("layout", "its number in the file"), *EACH.items()]
-    single = [[_text(row["solver"]), _number(row["layout"], "{:.0f}"), *_each(row)] for _, row in trials.iterrows()]
-    boards = [Board("Solvers", heads, rows), Board("Every layout", every, single)]
+    shown = trials.head(SHOWN)
+    single = [[_text(row["solver"]), _number(row["layout"], "{:.0f}"), *_each(row)] for _, row in shown.iterrows()]
+    cut = f"The first {SHOWN} of {len(trials)} rows of trials.parquet"
+    title = "Every layout" if len(shown) == len(trials) else cut
+    boards = [Board("Solvers", heads, rows), Board(title, every, single)]
     return page(f"{name}: judged", f"{len(trials) // len(summary)} layouts.", boards, NOTES)
 
 
