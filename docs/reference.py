@@ -18,6 +18,7 @@ import pdoc
 
 import torchgco
 
+FOLDER = Path(__file__).parent / "api"
 PAGES = (
     "torchgco", "torchgco.scenarios", "torchgco.missions", "torchgco.plotting", "torchgco.baselines",
     "torchgco.constraints", "torchgco.obstacles", "torchgco.solvers.contracts", "torchgco.lagrangian.penalties",
@@ -27,7 +28,7 @@ PAGES = (
 
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "api")
+    parser.add_argument("--output", type=Path, default=FOLDER, help="elsewhere the reference alone is made")
     output = parser.parse_args(words).output
     for name in ("compose", "read"):  # imported lazily: pdoc looks for them in the module
         vars(torchgco)[name] = getattr(torchgco, name)
@@ -37,7 +38,8 @@ def main(words: list[str] | None = None) -> int:
         _resolve(kind)
     pdoc.render.configure(docformat="google")
     pdoc.pdoc(*PAGES, output_directory=output)
-    options.PAGE.write_text(options.text())
+    if output == FOLDER:
+        options.PAGE.write_text(options.text())
     return 0
 
 
