@@ -42,7 +42,8 @@ def root(residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
     """z (..., q) where residual(z) (..., q), which maps each row by itself, is 0; NaN in rows where none is found.
 
     By Newton's method, with halved corrections where it must be. Its first and second derivatives by all that the
-    residual reads are those of the implicit function. Roots that the residual itself asks for, of as many rows, are found together with it.
+    residual reads are those of the implicit function. Roots that the residual itself asks for, of as many rows, are found
+    together with it.
     """
     if _AS_OPERATIONS.get():
         unknown = torch.ops.torchgco.unknown(guess)
@@ -103,7 +104,7 @@ def _newton(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
 
     A step serves where the correction that the same slopes ask for after it is less than the step itself: the natural
     monotonicity test, which no scale of the residual changes (Deuflhard, Newton Methods for Nonlinear Problems, section
-    3.3). Slopes serve again where it is a tenth at most, and the root is found where what is left is less than rounding.
+    3.3). Slopes serve again where it is a tenth at most; the root is found where what is left is less than rounding.
     """
     rest = residual(z).detach()
     lost = ~torch.isfinite(rest).all(-1)
