@@ -10,6 +10,7 @@
 #include "functions.h"
 
 #define NEWTON_EPSILON (TGCO_IS_DOUBLE ? 0x1p-52 : 0x1p-23)
+#define NEWTON_BY_ROUNDING (TGCO_IS_DOUBLE ? 0x1.428a2f98d7294p-35 : 0x1.965fea53d6e3ap-16) /* to the power 2/3 */
 #define NEWTON_MOST 30 /* evaluations of the equations after the first */
 #define NEWTON_SERVES_AGAIN 0.1 /* as in base/roots.py */
 
@@ -97,6 +98,7 @@ TGCO_INLINE int newton_next(
             z[i] = tgco_choose(better, ahead, z[i]);
         }
         s->share = tgco_choose(better, SET(1.0), SET(0.5) * s->share);
+        ends = ends | (NOT(better | s->done) & (s->length <= SET(NEWTON_BY_ROUNDING) * of_trial));
         s->done = s->done | ends;
         stale = better & NOT(ends) & (left > SET(NEWTON_SERVES_AGAIN) * s->length);
     }
