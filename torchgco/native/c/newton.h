@@ -7,6 +7,7 @@
 
    q is a constant where these functions are called: their loops are short. */
 #pragma once
+#include <stddef.h>
 #include "functions.h"
 
 #define NEWTON_EPSILON (TGCO_IS_DOUBLE ? 0x1p-52 : 0x1p-23)
