@@ -1,5 +1,4 @@
 /* MPPI (Algorithm 3): all rounds of sampled controls, problem by problem, with LANES samples side by side. */
-#include <float.h>
 #include "memory.h"
 #include "normal.h"
 #include "solids.h"
@@ -12,17 +11,17 @@
 typedef struct {
     const Sampling *of;
     Lanes s;
-    V *mean, *z, *sum, *lower, *upper, *deviation;
+    Numbers mean, z, sum, lower, upper, deviation;
     double *score;
-    V *memory;
+    Numbers memory;
 } Samples;
 
 /* Noise and controls of stage k. */
-static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
+static inline void draw(const Samples *q, int64_t k, OUT eps, OUT u) {
     const Sampling *o = q->of;
-    const V *lower = at(q->lower, &o->lower, k), *upper = at(q->upper, &o->upper, k);
+    IN lower = at(q->lower, &o->lower, k); IN upper = at(q->upper, &o->upper, k);
     for (int j = 0; j < NU; j++) {
-        const V *left = q->z + (o->knots > 0 ? o->left[k] : k) * NU + j;
+        IN left = q->z + (o->knots > 0 ? o->left[k] : k) * NU + j;
         V z = o->knots > 0 ? left[0] + SET(o->share[k]) * (left[NU] - left[0]) : left[0];
         eps[j] = z * q->deviation[j];
         V v = q->mean[k * NU + j] + eps[j];
@@ -32,7 +31,7 @@ static inline void draw(const Samples *q, int64_t k, V *eps, V *u) {
 
 #if DIM > 0
 /* How many obstacles of a kind each sample touches at knot k. */
-static inline V touched_solids(const Constraint *con, const Rows *rows, int64_t k, const V *x) {
+static inline V touched_solids(const Constraint *con, const Rows *rows, int64_t k, IN x) {
     V count = SET(0.0);
     if (is_kind(con, SPHERES)) {
         for (int j = 0; j < con->rows; j++) {
@@ -41,14 +40,14 @@ static inline V touched_solids(const Constraint *con, const Rows *rows, int64_t 
         }
     } else if (is_kind(con, BOXES)) {
         for (int j = 0; j < con->rows; j++)
-            if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, 0) >= SET(0.0));
-    } else if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, 0, 0) >= SET(0.0));
+            if (any(is_near(con, rows, j, x))) count += tgco_truth(solid(con, rows, j, k, x, NONE) >= SET(0.0));
+    } else if (!is_far_from_map(con, rows, x)) count += tgco_truth(field_row(con, rows, k, x, NONE, NONE) >= SET(0.0));
     return count;
 }
 #endif
 
 /* The number of obstacles that each sample touches at knot k; of a body, by each of its balls. */
-static V hits(const Samples *q, int64_t k, const V *x) {
+static V hits(const Samples *q, int64_t k, IN x) {
     const Problem *p = q->of->of;
     V count = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++) {
@@ -94,7 +93,7 @@ static void fly(Samples *q, int64_t first) {
             for (int j = 0; j < NU; j++)
                 likelihood += q->mean[k * NU + j] / (q->deviation[j] * q->deviation[j]) * eps[j];
     }
-    cost += cost_value(&q->s, p->N, x, 0);
+    cost += cost_value(&q->s, p->N, x, NONE);
     if (o->dwell_cost > 0) cost += SET(o->dwell_cost * p->N) * cost_value(&q->s, p->N - 1, x, u);
     cost += SET(o->temperature) * likelihood;
     for (int l = 0; l < LANES && first + l < o->samples; l++) {
@@ -131,7 +130,7 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
     int64_t N = o->of->N;
     memset(q->sum, 0, N * NU * BUNDLES * sizeof(V));
     for (int64_t first = 0; first < o->samples; first += LANES) {
-        V *sum = q->sum + first / LANES % BUNDLES;
+        OUT sum = q->sum + first / LANES % BUNDLES;
         V weight = SET(0.0), eps[NU], u[NU];
         for (int l = 0; l < LANES && first + l < o->samples; l++) LANE(weight, l) = (REAL)q->score[first + l];
         if (!any(weight > SET(0.0))) continue;
@@ -148,15 +147,20 @@ static void average(Samples *q, uint64_t key, int64_t rows) {
     }
 }
 
-static int begin(Samples *q, const Sampling *o) {
+static void leave_samples(Samples *q) {
+    give(q->of->of, q->score); give(q->of->of, q->memory);
+    finish(&q->s);
+}
+
+TGCO_LARGE int begin(Samples *q, const Sampling *o) {
     memset(q, 0, sizeof *q);
     q->of = o;
     int64_t N = o->of->N, rows = (o->knots ? o->knots : N) * NU;
     int64_t bounds = length(&o->lower, N) + length(&o->upper, N);
     if (!start(&q->s, o->of)) return 0;
-    q->memory = aligned_alloc(sizeof(V), ((1 + BUNDLES) * N * NU + rows + bounds + NU) * sizeof(V));
-    q->score = malloc((o->samples + o->elite) * sizeof(double));
-    if (!q->memory || !q->score) { finish(&q->s); free(q->memory); free(q->score); return 0; }
+    q->memory = take_numbers(o->of, (1 + BUNDLES) * N * NU + rows + bounds + NU);
+    q->score = (double *)take(o->of, (o->samples + o->elite) * sizeof(double));
+    if (!q->memory || !q->score) { leave_samples(q); return 0; }
     q->mean = q->memory; q->sum = q->mean + N * NU; q->z = q->sum + BUNDLES * N * NU;
     q->lower = q->z + rows; q->upper = q->lower + length(&o->lower, N);
     q->deviation = q->upper + length(&o->upper, N);
@@ -188,10 +192,8 @@ int tgco_sample(const Sampling *o, int64_t first, int64_t last) {
             weigh(o, q->score);
             average(q, key, rows);
         }
-        for (int64_t i = 0; i < size; i++) o->mean[e * size + i] = (double)q->mean[i][0];
+        for (int64_t i = 0; i < size; i++) o->mean[e * size + i] = (double)LANE(q->mean[i], 0);
     }
-    finish(&q->s);
-    free(q->memory);
-    free(q->score);
+    leave_samples(q);
     return 1;
 }

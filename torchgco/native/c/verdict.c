@@ -1,6 +1,5 @@
 /* What returned trajectories are judged by: violations, clearance, gains and what a step could still save, costates, and the
    rollouts that solves stand for. Functions return 0 without memory. */
-#include <float.h>
 #include "lifted.h"
 #include "sweep.h"
 
@@ -25,7 +24,7 @@ int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
 }
 
 /* Whether slightly other controls lead to other states than rounding would. */
-static I is_sensitive(const Lanes *s) {
+TGCO_LARGE I is_sensitive(const Lanes *s) {
     const Problem *p = s->of;
     V largest[NU], x[2 * NX], u[NU], apart = SET(0.0), size = SET(0.0);
     for (int j = 0; j < NU; j++) largest[j] = SET(0.0);
@@ -52,7 +51,7 @@ static void put_gains(Lanes *s, int64_t e, int used) {
     Sweep sweep = {SET(0.0), SET(0.0), SET(0.0), 0};
     if (p->sensitive) sensitive = is_sensitive(s);
     if (p->slack) sweep = swept(s, 0, 0, SET(0.0), &caught);
-    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
+    backward(s, CALLED(knot_expand), NONE, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares;
     for (int l = 0; l < used; l++) {
         p->cost[e + l] = LANE(linear, l);
@@ -71,7 +70,7 @@ static void put_costates(Lanes *s, int64_t e, int used) {
     int64_t N = p->N;
     V y[NX], g[S], H[S * S], f[NJ ? NJ : 1];
     for (int64_t k = N; k > 0; k--) {
-        const V *x = s->X + k * NX, *u = k < N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
         if (k < N) {
             model_jacobian(x, u, model_at(s, k), p->shared, f);
@@ -102,12 +101,12 @@ static I is_rounding(const Lanes *s) {
     return same;
 }
 
-static void follow(Lanes *s, I by_gains) {
+TGCO_LARGE void follow(Lanes *s, I by_gains) {
     const Problem *p = s->of;
     memcpy(s->Xn, s->X, NX * sizeof(V));
     for (int64_t k = 0; k < p->N; k++) {
-        V *x = s->Xn + k * NX, *u = s->Un + k * NU;
-        const V *K = s->G + k * NU * NZ;
+        OUT x = s->Xn + k * NX; OUT u = s->Un + k * NU;
+        IN K = s->G + k * NU * NZ;
         for (int j = 0; j < NU; j++) {
             u[j] = k ? s->U[k * NU + j] : s->U[j] + SET(0.0); /* no -0.0 */
             for (int i = 0; i < NX; i++) u[j] += tgco_if(by_gains, K[j * NZ + i]) * (x[i] - s->X[k * NX + i]);
@@ -150,7 +149,7 @@ int tgco_follow(const Problem *p, int64_t first, int64_t last) {
 
 #if DIM > 0
 /* Squared distance of the origin from the segment that begins at a and goes along. */
-static inline V from_segment(const V *a, const V *along) {
+static inline V from_segment(IN a, IN along) {
     V length = SET(0.0), toward = SET(0.0), square = SET(0.0);
     for (int i = 0; i < DIM; i++) { ADD(length, along[i], along[i]); SUBTRACT(toward, a[i], along[i]); }
     V share = tgco_choose(length > SET(0.0), toward / length, SET(0.0));
@@ -163,7 +162,7 @@ static inline V from_segment(const V *a, const V *along) {
    infinite without one. Here the lanes are knots: a problem alone takes as long as one of many. */
 int tgco_chords(const Problem *p, int64_t first, int64_t last) {
     int64_t N = p->N, blocks = (N + LANES - 1) / LANES;
-    V *points = aligned_alloc(sizeof(V), 2 * DIM * blocks * sizeof(V)); /* the first and the last one of each line */
+    Numbers points = take_numbers(p, 2 * DIM * blocks); /* the first and the last one of each line */
     if (!points) return 0;
     for (int64_t e = first; e < last; e++) {
         V least = SET(INFINITY), knot;
@@ -184,7 +183,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
                 if (!(squares[j] >= 0)) continue;
                 V radius = SET(p->gain * sqrt(squares[j])), a[DIM], along[DIM];
                 for (int64_t block = 0; block < blocks; block++) {
-                    const V *from = points + 2 * DIM * block, *to = from + DIM;
+                    IN from = points + 2 * DIM * block; IN to = from + DIM;
                     for (int l = 0; l < LANES; l++) LANE(knot, l) = block * LANES + l < N ? block * LANES + l : N - 1;
                     for (int d = 0; d < DIM; d++) {
                         V b = to[d] - SET(o[d]);
@@ -204,7 +203,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
         p->merit[e] = LANE(least, 0);
         for (int l = 1; l < LANES; l++) if (LANE(least, l) < p->merit[e] || LANE(least, l) != LANE(least, l)) p->merit[e] = LANE(least, l);
     }
-    free(points);
+    give(p, points);
     return 1;
 }
 #endif
