@@ -10,11 +10,11 @@ from tempfile import TemporaryDirectory
 
 import torch
 
-from torchgco.native.cuda.source import STRIDE
+from torchgco.native.cuda.source import THREADS, WARP
 
 FLAGS = "-std=c++20", "-march=native", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared"
 SET_THREAD = '\nextern "C" void set_thread(int64_t thread) { tgco_thread = thread; }\n'
-DIRTY = 0xFF
+AT_ONCE = 2  # threads that solve problems: the memory of one serves others after it
 
 
 @cache
@@ -28,29 +28,37 @@ def compiled(text: str, *flags: str) -> ctypes.CDLL:
 
 
 class Shim:
-    """A module of CUDA C++ on the CPU. Each problem has a thread of another place in a warp than the one before.
+    """A module of CUDA C++ on the CPU.
 
     Args:
-        stride: problems whose numbers are interleaved.
+        stride: problems whose numbers are interleaved, where threads have problems.
+
+    Attributes:
+        launched: the kernels.
     """
 
     device, multiprocessors = torch.device("cpu"), 1
 
-    def __init__(self, text: str, stride: int = STRIDE, *flags: str) -> None:
-        self._library = compiled(text.replace(f"#define STRIDE {STRIDE}\n", f"#define STRIDE {stride}\n"), *flags)
-        self.launched: list[str] = []
+    def __init__(self, text: str, stride: int = WARP, *flags: str) -> None:
+        text = text.replace(f"#define STRIDE {WARP}\n", f"#define STRIDE {stride}\n")
+        self._library, self.launched = compiled(text, *flags), list[str]()
 
     def free_bytes(self) -> int:
-        return 1 << 32
+        return 1 << 28
 
     def launch(self, kernel: str, blocks: int, *arguments: int) -> None:
         self.launched.append(kernel)
+        function = getattr(self._library, kernel)
+        call = lambda *values: function(*map(ctypes.c_int64, values))
+        if kernel.startswith("sample"):
+            for thread in range(blocks if kernel == "sample_weigh" else blocks * THREADS):
+                self._library.set_thread(ctypes.c_int64(thread))
+                call(*arguments)
+            return
         address, first, last, numbers, others, count, size, next_, lacks = arguments
-        threads = 2  # the memory of a problem serves others after it
+        ctypes.memset(numbers, 0xFF, 8 * count * WARP)  # numbers that aren't written first are NaN
+        ctypes.memset(others, 0xFF, size * AT_ONCE)
         for e in range(last - first):
-            thread = e % threads
-            ctypes.memset(numbers, DIRTY, 8 * count * threads * STRIDE) if e < threads else None
-            self._library.set_thread(ctypes.c_int64(thread))
+            self._library.set_thread(ctypes.c_int64(e % AT_ONCE))
             ctypes.c_int64.from_address(next_).value = e
-            most = [address, first, first + e + 1, numbers, others, count, size, next_, lacks]
-            getattr(self._library, kernel)(*map(ctypes.c_int64, most))
+            call(address, first, first + e + 1, numbers, others, count, size, next_, lacks)

@@ -26,7 +26,7 @@ from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit, build
 from torchgco.native.cuda.engine import Kernel, OnDevice
-from torchgco.native.cuda.source import SOLVER, Program
+from torchgco.native.cuda.source import SOLVER
 from torchgco.native.packing import (
     constraint_of,
     guide_of,
@@ -95,18 +95,18 @@ class Engine:
             ahead(self)
         self.library = self.further(self.lanes, lambda: self.form.units(lanes=self.lanes), SOLVER)
 
-    def further(self, name: Hashable, units: Callable[[], Sequence[Unit]], program: Program) -> Any:
+    def further(self, name: Hashable, units: Callable[[], Sequence[Unit]], *of_device: Any) -> Any:
         """A further library of this form, which this engine and those with other shared numbers keep.
 
         Args:
-            program: the same for a device, whose functions take the place of those on the CPU where there is one.
+            of_device: a `Program`, and the type of its numbers, of which a library is made where functions run on a device.
         """
         key = self.device, name
         if key not in self._libraries:
             with setting_up():
                 host = self._libraries.get((None, name)) or build(units())
                 self._libraries[None, name] = host
-                self._libraries[key] = host if self.device is None else self.device.library(self.form, host, program)
+                self._libraries[key] = host if self.device is None else self.device.library(self.form, host, *of_device)
         return self._libraries[key]
 
     def forget_values(self) -> None:

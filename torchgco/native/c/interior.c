@@ -439,13 +439,7 @@ TGCO_LARGE void leave_barrier(Barrier *t, const Track *k, int lane, int32_t stat
 }
 
 /* How many numbers of a lane a solve has room for. */
-int64_t tgco_room(const Interior *how) {
-    Barrier barrier, *t = &barrier;
-    if (!start_barrier(t, how)) return 0;
-    int64_t count = lay_out(&t->lanes, 0) + shape(t, 0) + 2;
-    finish_barrier(t);
-    return count;
-}
+int64_t tgco_room(const Interior *how) { return room_of(how); }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_interior(const Interior *how, int64_t first, int64_t last) {

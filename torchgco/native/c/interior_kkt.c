@@ -187,7 +187,7 @@ int64_t tgco_kkt_room(const Kkt *how) {
     System system;
     int64_t rows = 0;
     for (int64_t i = 0; i < how->of->constraints; i++) rows += how->of->constraint[i].knots * how->of->constraint[i].rows;
-    return tgco_room(&options) + lay_out_system(&system, how->of, rows, 0) + 1;
+    return room_of(&options) + lay_out_system(&system, how->of, rows, 0) + 1;
 }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */

@@ -69,6 +69,15 @@ static int start_barrier(Barrier *t, const Interior *how) {
     return 1;
 }
 
+/* How many numbers of a lane that takes. */
+static int64_t room_of(const Interior *how) {
+    Barrier barrier, *t = &barrier;
+    if (!start_barrier(t, how)) return 0;
+    int64_t count = lay_out(&t->lanes, 0) + shape(t, 0) + 2;
+    finish_barrier(t);
+    return count;
+}
+
 TGCO_LARGE void enter_barrier(Barrier *t, int lane, int64_t e) {
     enter_iterate(&t->lanes, lane, e);
     if (t->is_free) for (int i = 0; i < NX; i++) LANE(t->is_free[i], lane) = t->how->free_start[e * NX + i];

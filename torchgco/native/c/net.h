@@ -5,7 +5,7 @@
    from h on are of no account; tangents G are such arrays for each column. */
 #pragma once
 #include "functions.h"
-#include "wide.h" /* or wide_scalar.h */
+#include "wide.h" /* or scalar/wide.h */
 
 #define NET_SIZE(h) (((h) + 15) / 16 * 16) /* whole vectors of neurons or lanes, in single precision, too */
 

@@ -3,7 +3,7 @@
 #pragma once
 #include "constants.h"
 #include "lanes.h"
-#include "words.h" /* or words_scalar.h */
+#include "words.h" /* or scalar/words.h */
 
 static inline W mixed(W z) {
     z ^= z >> 16;
@@ -46,17 +46,24 @@ static inline void turn(F a, F *cosine, F *sine) {
     *sine = OF_BITS(d ^ ((quarter & 2) << 30));
 }
 
+/* The pair of draws of a number of each lane. */
+static inline void pair(uint64_t key, W number, F *cosine, F *sine) {
+    W word = mixed((number * WEYL) ^ (uint32_t)key);
+    F length = radius(uniform(word)), c, s;
+    turn(uniform(mixed(word ^ (uint32_t)(key >> 32))), &c, &s);
+    *cosine = length * c;
+    *sine = length * s;
+}
+
 /* Draws z (rows) of the samples first, first + 1, ..., one to a lane. */
 static void normal(uint64_t key, int64_t first, int64_t rows, V *z) {
     int64_t half = (rows + 1) / 2;
-    uint32_t low = (uint32_t)key, high = (uint32_t)(key >> 32);
     W number;
     for (int l = 0; l < LANES; l++) LANE(number, l) = (uint32_t)(first + l) * (uint32_t)half;
     for (int64_t i = 0; i < half; i++) {
-        W word = mixed(((number + (uint32_t)i) * WEYL) ^ low);
-        F length = radius(uniform(word)), cosine, sine;
-        turn(uniform(mixed(word ^ high)), &cosine, &sine);
-        z[i] = TGCO_CONVERTED(length * cosine, V);
-        if (i + half < rows) z[i + half] = TGCO_CONVERTED(length * sine, V);
+        F cosine, sine;
+        pair(key, number + (uint32_t)i, &cosine, &sine);
+        z[i] = TGCO_CONVERTED(cosine, V);
+        if (i + half < rows) z[i + half] = TGCO_CONVERTED(sine, V);
     }
 }

@@ -2,6 +2,7 @@
    writes wherever they lie, and what it makes of these; the types point into a problem's memory alone. cuda/c/strided.h has
    the same where the memory of several problems is interleaved. */
 #pragma once
+#include "vectors.h" /* or scalar/vectors.h */
 
 #define IN const V *
 #define OUT V *

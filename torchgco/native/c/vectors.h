@@ -1,4 +1,4 @@
-/* Vectors V of LANES numbers of type REAL, and what truth of their lanes is, I. scalar.h has
+/* Vectors V of LANES numbers of type REAL, and what truth of their lanes is, I. scalar/vectors.h has
    the same for a single lane. */
 #pragma once
 #include "standard.h"
@@ -9,7 +9,6 @@
 
 typedef REAL V __attribute__((vector_size(LANES * sizeof(REAL))));
 typedef __typeof__((V){0} == (V){0}) I; /* all bits of a lane set where true */
-#include "pointers.h"
 #define LANE(a, l) ((a)[l])
 #define NOT(where) (~(where))
 

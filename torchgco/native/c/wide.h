@@ -1,4 +1,4 @@
-/* Vectors of NET_WIDTH neurons of one problem; wide_scalar.h has the same in plain C. */
+/* Vectors of NET_WIDTH neurons of one problem; scalar/wide.h has the same in plain C. */
 #pragma once
 #include "lanes.h"
 

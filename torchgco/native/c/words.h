@@ -1,5 +1,6 @@
 /* As many numbers of 32 bits as there are lanes, and numbers of other types that have the same values, or the same bits. */
 #pragma once
+#include "standard.h"
 
 typedef uint32_t W __attribute__((vector_size(LANES * 4)));
 typedef int32_t Z __attribute__((vector_size(LANES * 4)));

@@ -11,7 +11,8 @@ from torchgco.native import structures as c
 from torchgco.native.codegen.source import Form
 from torchgco.native.cuda import launch
 from torchgco.native.cuda.source import Program, source
-from torchgco.native.declarations import Structure
+
+SIZES = {"double": 8, "float": 4}  # bytes
 
 
 @dataclass(frozen=True)
@@ -24,21 +25,21 @@ class OnDevice:
 
     load: Callable[[str], launch.Module]
 
-    def library(self, form: Form, host: ctypes.CDLL, program: Program) -> Library:
+    def library(self, form: Form, host: ctypes.CDLL, program: Program, real: str = "double") -> Library:
         """A library whose functions have kernels on the device; `host` has all of them."""
-        return Library(host, self.load(source(form, program)), program)
+        return Library(host, self.load(source(form, program, real)), program, real)
 
 
 class Library:
     """A library of C, of which some functions run on a device."""
 
-    def __init__(self, host: ctypes.CDLL, module: launch.Module, program: Program) -> None:
-        self._host, self._module, self._program = host, module, program
+    def __init__(self, host: ctypes.CDLL, module: launch.Module, program: Program, real: str) -> None:
+        self._host, self._module, self._program, self._size = host, module, program, SIZES[real]
 
     def __getattr__(self, name: str) -> Any:
-        if name not in self._program.kernels:
+        if name not in self._program.functions:
             return getattr(self._host, name)
-        return Kernel(self._module, name, getattr(self._host, self._program.room_of(name)))
+        return Kernel(self._module, name, getattr(self._host, self._program.room_of(name)), self._size)
 
 
 @dataclass(frozen=True)
@@ -46,27 +47,26 @@ class Kernel:
     """A function on a device.
 
     Attributes:
-        room: the function of C on the CPU that says how many numbers a solve of its structure needs.
+        room: the function of C on the CPU that says how many numbers, of `size` bytes, a problem needs.
     """
 
     module: launch.Module
     name: str
     room: Any
+    size: int
 
-    def __call__(self, argument: Structure, first: int, last: int) -> None:
+    def __call__(self, argument: Any, first: int, last: int) -> None:
         """Call it on the problems first, ..., last - 1, as `native.engine.run` calls functions on the CPU.
 
         Raises:
             MemoryError: the device hasn't enough memory.
         """
         if isinstance(argument, c.Problem):
-            argument = argument.copy({"replicas": 1})  # a thread has a single lane
-        problem = argument if isinstance(argument, c.Problem) else problem_of(argument)
-        asked = problem if self.room.__name__ == "tgco_solver_room" else argument
-        numbers = launch.room_of(self.room, asked)
-        launch.run(self.module, self.name, argument, problem, numbers, first, last)
-
-
-def problem_of(argument: Any) -> c.Problem:
-    """The problem that a structure points to."""
-    return c.Problem.from_address(argument.of)
+            argument = problem = argument.copy({"replicas": 1})  # a thread has a single lane
+        else:
+            problem = c.Problem.from_address(argument.of)
+        numbers = launch.room_of(self.room, problem if isinstance(argument, c.Outer) else argument)
+        if isinstance(argument, c.Sampling):
+            launch.sample(self.module, argument, problem, numbers, self.size, first, last)
+        else:
+            launch.solve(self.module, self.name, argument, problem, numbers, first, last)

@@ -8,15 +8,16 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchgco.native.cuda.source import THREADS
+from torchgco.native.cuda.source import SAMPLES, THREADS
 from torchgco.native.declarations import Structure, kept_by
-from torchgco.native.structures import Problem
+from torchgco.native.structures import Problem, Sampling
 
 # Blocks of a multiprocessor at the same time, where each thread has the 255 registers that it may have at most: 65,536.
 BLOCKS = 65536 // (256 * THREADS)
 ROWS = 8 * 13  # bytes of the structure Rows, and of two pointers, for each constraint: see memory.h, interior_memory.h
 SHARE = 0.5  # of a device's free memory that a call may take: what it reads lies there, too
 _WORD = 8
+SUMS = {8: 8, 4: 16}  # partial sums over samples, by the bytes of a number: see mppi.c
 
 
 class Module(Protocol):
@@ -110,19 +111,19 @@ def room_of(function: Any, structure: Structure) -> int:
     return int(function(ctypes.byref(structure)))
 
 
-def run(
+def solve(
     module: Module, name: str, structure: Structure, problem: Problem, numbers: int, first: int, last: int
 ) -> None:
-    """Call a function of C on the problems first, ..., last - 1.
+    """Call a function of C on the problems first, ..., last - 1: a thread each, which then takes the next.
 
     Args:
         problem: that `structure` is, or points to.
-        numbers: that the solve of a problem needs memory for.
+        numbers: that a problem needs memory for.
 
     Raises:
         MemoryError: the device hasn't enough memory for a warp.
     """
-    others = ROWS * (problem.constraints + 1) + 64
+    others = _others(problem)
     each = _WORD * numbers + others
     placed = Placed(structure, module.device)
     most = int(SHARE * module.free_bytes()) // (each * THREADS)
@@ -141,3 +142,45 @@ def run(
     if int(counters[1]):
         raise MemoryError(f"kernels of {module.device}: {name} needs more than {each} bytes for a problem")
     placed.read_back()
+
+
+def sample(module: Module, how: Sampling, problem: Problem, numbers: int, size: int, first: int, last: int) -> None:
+    """All rounds of MPPI for the problems first, ..., last - 1: a thread per sample.
+
+    Args:
+        numbers: that a problem needs memory for, of `size` bytes each.
+
+    Raises:
+        MemoryError: the device hasn't enough memory for a problem.
+    """
+    others = _others(problem) + _WORD * (how.samples + how.elite)
+    each, device = size * numbers + others + SAMPLES, module.device
+    placed = Placed(how, device)
+    count = min(last - first, int(SHARE * module.free_bytes()) // each)
+    if count == 0:
+        raise MemoryError(f"kernels of {device}: no {each} bytes for the samples of a problem")
+    make = lambda bytes_: torch.empty(count * bytes_, dtype=torch.uint8, device=device)
+    room, beside, samples = make(size * numbers), make(others), make(SAMPLES)
+    lacks = torch.zeros(1, dtype=torch.int64, device=device)
+    o, all_ = placed.address, samples.data_ptr()
+    stages = problem.N * SUMS[size]
+    controls = kept_by(how)[how.mean][0].numel()
+    for begin in range(first, last, count):
+        problems = min(count, last - begin)
+        start = lambda kernel, threads, *arguments: module.launch(kernel, -(-threads // THREADS), *arguments)
+        memory = room.data_ptr(), beside.data_ptr(), numbers, others, lacks.data_ptr()
+        start("sample_begin", problems, o, all_, begin, problems, *memory)
+        for i in range(how.rounds):
+            start("sample_round", problems, all_, begin, problems, i)
+            start("sample_fly", problems * how.samples, o, all_, problems)
+            module.launch("sample_weigh", problems, o, all_)
+            start("sample_average", problems * stages, o, all_, problems)
+            start("sample_mean", problems * controls, o, all_, begin, problems)
+    if int(lacks):
+        raise MemoryError(f"kernels of {device}: samples need more than {each} bytes for a problem")
+    placed.read_back()
+
+
+def _others(problem: Problem) -> int:
+    """Bytes that a problem needs beside numbers."""
+    return ROWS * (problem.constraints + 1) + 64

@@ -11,43 +11,57 @@ from torchgco.native.includes import C
 from torchgco.native.structures import HEADER
 
 HERE = Path(__file__).parent / "c"
-STRIDE = 32  # problems whose numbers are interleaved: a warp's
-THREADS = 128  # threads of a block: each may have as many registers as there are
-_SCALAR = {"vectors.h": C / "scalar.h", "wide.h": C / "wide_scalar.h", "words.h": C / "words_scalar.h"}
-_OWN = {
-    "standard.h": HERE / "standard.h", "pointers.h": HERE / "strided.h", "allocation.h": HERE / "arena.h",
-    "clock.h": HERE / "clock.h", "asking.h": HERE / "asking.h", "kernels.h": HERE / "kernels.h",
-}  # fmt: skip
+WARP = 32
+THREADS = 128  # of a block
+SAMPLES = 1024  # bytes of the structure Samples, at most
+OF_ONE = {name: C / "scalar" / name for name in ("vectors.h", "wide.h", "words.h")}
+ON_DEVICE = "standard.h", "allocation.h", "clock.h", "asking.h", "noise.h", "strided.h", "kernels.h", "sampling.h"
 
 
 @dataclass(frozen=True)
 class Program:
-    """What a program for a GPU is made of: files of C beside the model's, and kernels by the structures that they read."""
+    """What a program for a device is made of.
+
+    Attributes:
+        files: of C, beside those of the model and its cost, and the file with kernels.
+        functions: of C that have a kernel, and the structures that they read.
+        stride: problems whose numbers are interleaved.
+    """
 
     files: tuple[str, ...]
-    kernels: Mapping[str, str]
+    functions: Mapping[str, str]
+    stride: int
 
     def room_of(self, name: str) -> str:
-        """The function of C that says how many numbers a solve of this one needs."""
-        return {"Interior": "tgco_room", "Kkt": "tgco_kkt_room"}.get(self.kernels[name], "tgco_solver_room")
+        """The function of C that says how many numbers a solve by this one needs."""
+        return ROOMS[self.functions[name]]
 
 
+ROOMS = {"Interior": "tgco_room", "Kkt": "tgco_kkt_room", "Sampling": "tgco_sampler_room"}
+ROOMS |= dict.fromkeys(("Problem", "Outer"), "tgco_solver_room")
 _OF_PROBLEMS = (
     "value", "open_loop", "closed_loop", "begin", "expand", "ilqr", "descend", "lift", "violation", "penetration",
     "gains", "costates", "follow",
 )  # fmt: skip
 SOLVER = Program(
-    ("passes.c", "trajectories.c", "outer.c", "verdict.c"),
-    {"tgco_outer": "Outer", **{f"tgco_{name}": "Problem" for name in _OF_PROBLEMS}},
-)
+    ("passes.c", "trajectories.c", "outer.c", "verdict.c", "kernels.h"),
+    {"tgco_outer": "Outer", **{f"tgco_{name}": "Problem" for name in _OF_PROBLEMS}}, WARP,
+)  # fmt: skip
 INTERIOR = Program(
-    ("riccati.c", "interior.c", "interior_kkt.c"), {"tgco_interior": "Interior", "tgco_kkt": "Kkt"}
+    ("riccati.c", "interior.c", "interior_kkt.c", "kernels.h"), {"tgco_interior": "Interior", "tgco_kkt": "Kkt"}, WARP
 )
+# All threads of a problem read the same numbers.
+SAMPLER = Program(("mppi.c", "sampling.h"), {"tgco_sample": "Sampling"}, 1)
 
 
-def source(form: Form, program: Program, stride: int = STRIDE, threads: int = THREADS) -> str:
-    """The text that NVRTC compiles; g++ compiles it, too, with calls in place of threads."""
-    given = {name: path.read_text() for name, path in (_SCALAR | _OWN).items()}
-    text = form.alone((*program.files, "kernels.h"), given, STRIDE=stride, THREADS=threads)
-    kernels = "".join(f"KERNEL({kind}, {name})\n" for name, kind in program.kernels.items())
-    return text + HEADER.layout + kernels
+def source(form: Form, program: Program, real: str = "double", stride: int | None = None) -> str:
+    """The text that NVRTC compiles for numbers of type `real`; g++ compiles it, too, with calls in place of threads."""
+    stride = program.stride if stride is None else stride
+    given = {name: path.read_text() for name, path in OF_ONE.items()}
+    given |= {name: (HERE / name).read_text() for name in ON_DEVICE}
+    given["pointers.h"] = given.pop("strided.h") if program.stride > 1 else (C / "pointers.h").read_text()
+    sizes = {"STRIDE": stride, "THREADS": THREADS, "SAMPLES": SAMPLES}
+    text = form.alone(program.files, given, REAL=real, **sizes) + HEADER.layout
+    if "kernels.h" in program.files:
+        text += "".join(f"KERNEL({kind}, {name})\n" for name, kind in program.functions.items())
+    return text

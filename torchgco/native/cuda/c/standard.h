@@ -21,9 +21,11 @@ typedef unsigned long long uint64_t;
 #define DBL_MAX 0x1.fffffffffffffp+1023
 #define DBL_EPSILON 0x1p-52
 
-/* The number of this thread among all, and in its block. */
+/* The number of this thread among all, and in its block, of which there are so many; that of its block. */
 #define THREAD ((int64_t)blockIdx.x * blockDim.x + threadIdx.x)
 #define LOCAL_THREAD ((int)threadIdx.x)
+#define LOCAL_THREADS ((int)blockDim.x)
+#define BLOCK_NUMBER ((int64_t)blockIdx.x)
 
 static void memmove_down(void *to, const void *from, size_t bytes) {
     for (size_t i = 0; i < bytes; i++) ((char *)to)[i] = ((const char *)from)[i];
@@ -41,6 +43,9 @@ static void memmove_down(void *to, const void *from, size_t bytes) {
 static int64_t tgco_thread;
 #define THREAD tgco_thread
 #define LOCAL_THREAD 0
+#define LOCAL_THREADS 1
+#define BLOCK_NUMBER tgco_thread
+#define __syncthreads() ((void)0)
 static inline unsigned long long atomicAdd(unsigned long long *at, unsigned long long more) {
     unsigned long long before = *at;
     *at += more;

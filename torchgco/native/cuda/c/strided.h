@@ -25,6 +25,7 @@ template <class T> struct Strided {
     Strided &operator+=(int64_t i) { return *this = *this + i; }
     Strided operator++(int) { Strided old = *this; *this += 1; return old; }
     explicit operator bool() const { return place != 0; }
+    explicit operator char *() const { return place; }
 };
 typedef Strided<V> Numbers;
 typedef Strided<V> ConstNumbers;

@@ -7,7 +7,6 @@
 
 typedef REAL V;
 typedef int I;
-#include "pointers.h"
 #define LANE(a, l) (a)
 #define NOT(where) (!(where))
 

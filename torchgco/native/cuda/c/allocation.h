@@ -29,7 +29,7 @@ static void *take(const Problem *p, size_t bytes) {
 
 static Numbers take_numbers(const Problem *p, int64_t count) {
     Arena *own = tgco_arenas + LOCAL_THREAD;
-    Numbers memory((void *)(own->numbers + own->used * (int64_t)(STRIDE * sizeof(V))));
+    Numbers memory = (Numbers)(void *)(own->numbers + own->used * (int64_t)(STRIDE * sizeof(V)));
     if (own->used + count > own->count) return NONE;
     own->used += count;
     for (int64_t i = 0; i < count; i++) memory[i] = SET(0.0);
@@ -37,14 +37,10 @@ static Numbers take_numbers(const Problem *p, int64_t count) {
 }
 
 /* What was taken later goes with it. */
-static void give(const Problem *p, const void *memory) {
+template <class Pointer> static void give(const Problem *p, Pointer memory) {
     Arena *own = tgco_arenas + LOCAL_THREAD;
-    int64_t place = (const char *)memory - own->others;
-    if (memory && place < own->taken) own->taken = place;
-}
-
-static void give(const Problem *p, Numbers memory) {
-    Arena *own = tgco_arenas + LOCAL_THREAD;
-    int64_t place = (memory.place - own->numbers) / (int64_t)(STRIDE * sizeof(V));
-    if (memory && place < own->used) own->used = place;
+    char *at = (char *)memory;
+    int64_t each = STRIDE * sizeof(V), number = (at - own->numbers) / each, other = at - own->others;
+    if (at >= own->numbers && number < own->used) own->used = number;
+    else if (at >= own->others && other < own->taken) own->taken = other;
 }

@@ -1,6 +1,6 @@
 /* words.h of a single lane. */
 #pragma once
-#include <string.h>
+#include "standard.h"
 
 typedef uint32_t W;
 typedef int32_t Z;
