@@ -15,6 +15,7 @@ from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
 from torchgco.kernels.elsewhere import copied_to as copied_to
 from torchgco.kernels.elsewhere import on_cpu as on_cpu
+from torchgco.kernels.elsewhere import served_by as served_by
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
 from torchgco.kernels.verbs import cost_unit as cost_unit

@@ -1,4 +1,4 @@
-"""Problems of a GPU that C solves on the CPU, by copies.
+"""Problems of a GPU, by copies: C serves them on the CPU, but for what iterates on many, which runs on their device.
 
 PyTorch's kernels start hundreds of small operations for each stage: on a GPU a solve takes some hundred times as long
 as in C on one core.
@@ -7,6 +7,9 @@ as in C on one core.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -16,6 +19,8 @@ from torchgco.base.errors import DeviceWarning
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import field_names, mapped
 from torchgco.kernels.choice import native, serves
+from torchgco.native.cuda.compiler import Loaded, available
+from torchgco.native.cuda.engine import OnDevice, working_on
 from torchgco.problem.problem import Problem
 
 
@@ -29,15 +34,29 @@ def on_cpu(problem: Problem) -> Problem | None:
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
     there = _held_on_cpu(problem)
-    with computing_on(CPU):
+    with computing_on(CPU), served_by(problem):
         if not serves(there):
             return None
     global _said
-    if not _said:
+    if not _said and on_device(device) is None:
         _said = True
         told = f"problems on {device} are solved by C on the CPU, with copies: PyTorch's kernels take far longer there"
         warnings.warn(told, DeviceWarning, stacklevel=4)
     return there
+
+
+@cache
+def on_device(device: torch.device) -> OnDevice | None:
+    """The kernels of a device; None where it has none, or the extra `cuda` isn't installed."""
+    return OnDevice(partial(Loaded, device=device)) if device.type == "cuda" and available() else None
+
+
+@contextmanager
+def served_by(problem: Problem) -> Iterator[None]:
+    """In this block what iterates on many problems runs on this one's device, if that has kernels."""
+    device = on_device(problem.x0.device) if native() else None
+    with nullcontext() if device is None else working_on(device):
+        yield
 
 
 def _held_on_cpu(problem: Problem) -> Problem:

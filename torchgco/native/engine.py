@@ -25,7 +25,7 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit, build
-from torchgco.native.cuda.engine import Kernel, OnDevice
+from torchgco.native.cuda.engine import Kernel, Library, current
 from torchgco.native.cuda.source import SOLVER
 from torchgco.native.packing import (
     constraint_of,
@@ -59,8 +59,6 @@ class Engine:
         NativeError: no compiler, or it refuses the source.
     """
 
-    device: OnDevice | None = None  # on which its functions run; None: on the CPU
-
     @setting_up()
     def __init__(self, problem: Problem, ahead: Callable[[Engine], None] | None = None, compiles: bool = True) -> None:
         if problem.x0.dtype != torch.float64 or problem.x0.device.type != "cpu":
@@ -91,7 +89,7 @@ class Engine:
     def serve(self, B: int, ahead: Callable[[Engine], None] | None = None) -> None:
         """Have the library that suits solves of B problems, all in all; `ahead` is called before it is compiled."""
         self.B, self.lanes = B, lanes_for(B, LANES_OF_ONE)
-        if ahead is not None and (self.device, self.lanes) not in self._libraries:
+        if ahead is not None and (None, self.lanes) not in self._libraries:
             ahead(self)
         self.library = self.further(self.lanes, lambda: self.form.units(lanes=self.lanes), SOLVER)
 
@@ -101,12 +99,13 @@ class Engine:
         Args:
             of_device: a `Program`, and the type of its numbers, of which a library is made where functions run on a device.
         """
-        key = self.device, name
+        device = current()
+        key = device, name
         if key not in self._libraries:
             with setting_up():
                 host = self._libraries.get((None, name)) or build(units())
                 self._libraries[None, name] = host
-                self._libraries[key] = host if self.device is None else self.device.library(self.form, host, *of_device)
+                self._libraries[key] = host if device is None else Library(device, self.form, host, *of_device)
         return self._libraries[key]
 
     def forget_values(self) -> None:
@@ -265,7 +264,9 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure, first
     if count == 0:
         return
     if isinstance(function, Kernel):
-        return function(argument, first, first + count)
+        if function.served(argument, first, count):
+            return
+        function = function.host
     groups, threads = -(-count // group), torch.get_num_threads()
     if groups == 1 or threads == 1:
         if not function(ctypes.byref(argument), ctypes.c_int64(first), ctypes.c_int64(first + count)):

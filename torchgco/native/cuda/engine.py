@@ -1,17 +1,28 @@
-"""Libraries whose functions run on a device, with the calls of those on the CPU."""
+"""Functions of C that run on a device, with the calls of those on the CPU."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import torch
+
+from torchgco.base.errors import DeviceWarning
 from torchgco.native import structures as c
 from torchgco.native.codegen.source import Form
+from torchgco.native.compiler import NativeError
 from torchgco.native.cuda import launch
 from torchgco.native.cuda.source import Program, source
 
+# Problems or samples, for each thread of the CPU, from which on a device is asked. An estimate: a thread of an H200 is
+# some hundred times slower than a core, so that this many are two to four times as fast.
+LEAST = 512
 SIZES = {"double": 8, "float": 4}  # bytes
 
 
@@ -21,52 +32,93 @@ class OnDevice:
 
     Attributes:
         load: has a text of CUDA C++ compiled, and loads it.
+        least: see `LEAST`.
     """
 
     load: Callable[[str], launch.Module]
+    least: int = LEAST
 
-    def library(self, form: Form, host: ctypes.CDLL, program: Program, real: str = "double") -> Library:
-        """A library whose functions have kernels on the device; `host` has all of them."""
-        return Library(host, self.load(source(form, program, real)), program, real)
+
+_device: ContextVar[OnDevice | None] = ContextVar("_device", default=None)
+
+
+def current() -> OnDevice | None:
+    """What serves problems on a device now; None: all are solved on the CPU."""
+    return _device.get()
+
+
+@contextmanager
+def working_on(device: OnDevice | None) -> Iterator[None]:
+    """In this block kernels are made for a device."""
+    before = _device.set(device)
+    try:
+        yield
+    finally:
+        _device.reset(before)
 
 
 class Library:
-    """A library of C, of which some functions run on a device."""
+    """A library of C, of which some functions run on a device; each is compiled when it is first called.
 
-    def __init__(self, host: ctypes.CDLL, module: launch.Module, program: Program, real: str) -> None:
-        self._host, self._module, self._program, self._size = host, module, program, SIZES[real]
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in self._program.functions:
-            return getattr(self._host, name)
-        return Kernel(self._module, name, getattr(self._host, self._program.room_of(name)), self._size)
-
-
-@dataclass(frozen=True)
-class Kernel:
-    """A function on a device.
-
-    Attributes:
-        room: the function of C on the CPU that says how many numbers, of `size` bytes, a problem needs.
+    Args:
+        host: has all functions.
     """
 
-    module: launch.Module
-    name: str
-    room: Any
-    size: int
+    def __init__(self, device: OnDevice, form: Form, host: ctypes.CDLL, program: Program, real: str = "double") -> None:
+        self.device, self.form, self.host, self.program, self.real = device, form, host, program, real
+        self._kernels: dict[str, Kernel] = {}
 
-    def __call__(self, argument: Any, first: int, last: int) -> None:
-        """Call it on the problems first, ..., last - 1, as `native.engine.run` calls functions on the CPU.
+    def __getattr__(self, name: str) -> Any:
+        if name not in self.program.functions:
+            return getattr(self.host, name)
+        if name not in self._kernels:
+            self._kernels[name] = Kernel(self, name)
+        return self._kernels[name]
 
-        Raises:
-            MemoryError: the device hasn't enough memory.
+
+class Kernel:
+    """A function of a library on its device.
+
+    Attributes:
+        host: the same on the CPU.
+    """
+
+    def __init__(self, library: Library, name: str) -> None:
+        self.library, self.name, self.host = library, name, getattr(library.host, name)
+        self._refused = False
+
+    @cached_property
+    def module(self) -> launch.Module:
+        """The program with this function."""
+        library = self.library
+        return library.device.load(source(library.form, library.program, self.name, library.real))
+
+    def served(self, argument: Any, first: int, count: int) -> bool:
+        """Call it on `count` problems; False where the CPU is to do that, as it is faster, or the device can't.
+
+        A DeviceWarning says once why a device can't.
         """
+        threads = count * (argument.samples if isinstance(argument, c.Sampling) else 1)
+        if self._refused or threads < self.library.device.least * torch.get_num_threads():
+            return False
+        try:
+            self._run(argument, first, first + count)
+        except (NativeError, MemoryError, torch.OutOfMemoryError) as error:
+            self._refused = isinstance(error, NativeError)
+            told = f"solved by C on the CPU, and not on the device: {str(error).splitlines()[0]}"
+            warnings.warn(told, DeviceWarning, stacklevel=2)
+            return False
+        return True
+
+    def _run(self, argument: Any, first: int, last: int) -> None:
         if isinstance(argument, c.Problem):
             argument = problem = argument.copy({"replicas": 1})  # a thread has a single lane
         else:
             problem = c.Problem.from_address(argument.of)
-        numbers = launch.room_of(self.room, problem if isinstance(argument, c.Outer) else argument)
+        room = getattr(self.library.host, self.library.program.room_of(self.name))
+        numbers = launch.room_of(room, problem if isinstance(argument, c.Outer) else argument)
         if isinstance(argument, c.Sampling):
-            launch.sample(self.module, argument, problem, numbers, self.size, first, last)
+            size = SIZES[self.library.real]
+            launch.sample(self.module, argument, problem, numbers, size, first, last)
         else:
             launch.solve(self.module, self.name, argument, problem, numbers, first, last)

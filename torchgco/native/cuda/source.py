@@ -24,7 +24,7 @@ class Program:
 
     Attributes:
         files: of C, beside those of the model and its cost, and the file with kernels.
-        functions: of C that have a kernel, and the structures that they read.
+        functions: of C that run on a device, and the structures that they read: those that iterate.
         stride: problems whose numbers are interleaved.
     """
 
@@ -39,13 +39,9 @@ class Program:
 
 ROOMS = {"Interior": "tgco_room", "Kkt": "tgco_kkt_room", "Sampling": "tgco_sampler_room"}
 ROOMS |= dict.fromkeys(("Problem", "Outer"), "tgco_solver_room")
-_OF_PROBLEMS = (
-    "value", "open_loop", "closed_loop", "begin", "expand", "ilqr", "descend", "lift", "violation", "penetration",
-    "gains", "costates", "follow",
-)  # fmt: skip
 SOLVER = Program(
     ("passes.c", "trajectories.c", "outer.c", "verdict.c", "kernels.h"),
-    {"tgco_outer": "Outer", **{f"tgco_{name}": "Problem" for name in _OF_PROBLEMS}}, WARP,
+    {"tgco_outer": "Outer", "tgco_ilqr": "Problem", "tgco_descend": "Problem"}, WARP,
 )  # fmt: skip
 INTERIOR = Program(
     ("riccati.c", "interior.c", "interior_kkt.c", "kernels.h"), {"tgco_interior": "Interior", "tgco_kkt": "Kkt"}, WARP
@@ -54,14 +50,17 @@ INTERIOR = Program(
 SAMPLER = Program(("mppi.c", "sampling.h"), {"tgco_sample": "Sampling"}, 1)
 
 
-def source(form: Form, program: Program, real: str = "double", stride: int | None = None) -> str:
-    """The text that NVRTC compiles for numbers of type `real`; g++ compiles it, too, with calls in place of threads."""
-    stride = program.stride if stride is None else stride
+def source(form: Form, program: Program, name: str, real: str = "double") -> str:
+    """The text that NVRTC compiles for a function; g++ compiles it, too, with calls in place of threads.
+
+    Args:
+        real: the type of numbers.
+    """
     given = {name: path.read_text() for name, path in OF_ONE.items()}
     given |= {name: (HERE / name).read_text() for name in ON_DEVICE}
     given["pointers.h"] = given.pop("strided.h") if program.stride > 1 else (C / "pointers.h").read_text()
-    sizes = {"STRIDE": stride, "THREADS": THREADS, "SAMPLES": SAMPLES}
+    sizes = {"STRIDE": program.stride, "THREADS": THREADS, "SAMPLES": SAMPLES}
     text = form.alone(program.files, given, REAL=real, **sizes) + HEADER.layout
     if "kernels.h" in program.files:
-        text += "".join(f"KERNEL({kind}, {name})\n" for name, kind in program.functions.items())
+        text += f"KERNEL({program.functions[name]}, {name})\n"
     return text

@@ -1,0 +1,101 @@
+"""CUDA C++ to a program on a device: NVRTC compiles it, through cuda-core, and the cache keeps it for the next process."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+
+from torchgco.base.clock import setting_up
+from torchgco.base.notices import notice
+from torchgco.native import store
+from torchgco.native.compiler import NativeError
+from torchgco.native.cuda.source import THREADS
+
+# No product is fused with a sum but where the code says so: bits are those of C (lanes.h).
+OPTIONS = {"std": "c++20", "fma": False, "device_as_default_execution_space": True}
+_ERROR_LINES = 5
+
+
+@cache
+def available() -> bool:
+    """Whether the extra `cuda` is installed, and PyTorch sees a device."""
+    try:
+        return find_spec("cuda.core") is not None and torch.cuda.is_available()
+    except ModuleNotFoundError:  # there is no package `cuda` at all
+        return False
+
+
+def cubin(text: str, arch: str) -> bytes:
+    """A program for devices of an architecture, such as sm_90.
+
+    Raises:
+        NativeError: NVRTC is missing or refuses the text; its first errors are named.
+    """
+    version = _version()
+    kin = text.encode().translate(None, b"0123456789abcdefxp.+-").decode(errors="replace")
+    key = store.key_of(("cubin 1", text, arch, version, str(OPTIONS)), kin)
+    known = store.read(key, ".cubin")
+    if known is not None:
+        return known
+    with setting_up():
+        notice("compiling kernels for the GPU (once for this form of problem) ...", brief=False)
+        made = _compiled(text, arch)
+    store.save(key, ".cubin", made)
+    return made
+
+
+def _version() -> str:
+    try:
+        from cuda.bindings import nvrtc
+
+        return ".".join(map(str, nvrtc.nvrtcVersion()[1:]))
+    except (ImportError, RuntimeError) as error:  # the latter: its library isn't found
+        raise NativeError(f"no NVRTC found: {str(error).splitlines()[0]}; `pip install torchgco[cuda]`") from error
+
+
+def _compiled(text: str, arch: str) -> bytes:
+    from cuda.core import Program, ProgramOptions
+
+    try:
+        options: Any = ProgramOptions(arch=arch, **OPTIONS)
+        return bytes(Program(text, "c++", options).compile("cubin").code)
+    except Exception as error:  # NVRTCError, which cuda-core exports nowhere
+        if type(error).__name__ != "NVRTCError":
+            raise
+        said = [line for line in str(error).splitlines() if "error" in line]
+        raise NativeError("\n".join(["NVRTC failed:", *said[:_ERROR_LINES]])) from error
+
+
+class Loaded:
+    """A program on a device; see `launch.Module`.
+
+    Raises:
+        NativeError: NVRTC is missing or refuses the text.
+    """
+
+    def __init__(self, text: str, device: torch.device) -> None:
+        from cuda.core import Device, ObjectCode
+
+        index = torch.cuda.current_device() if device.index is None else device.index
+        self.device = torch.device("cuda", index)
+        torch.zeros(1, device=self.device)  # PyTorch's context, which its tensors are in
+        self._device = Device(index)
+        with torch.cuda.device(self.device):
+            self._device.set_current()
+            self.multiprocessors = int(self._device.properties.multiprocessor_count)
+            self._code = ObjectCode.from_cubin(cubin(text, f"sm_{self._device.arch}"))
+
+    def free_bytes(self) -> int:
+        free, _ = torch.cuda.mem_get_info(self.device)
+        return free + torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
+
+    def launch(self, kernel: str, blocks: int, *arguments: int) -> None:
+        from cuda.core import LaunchConfig, launch
+
+        with torch.cuda.device(self.device):
+            self._device.set_current()
+            config = LaunchConfig(grid=blocks, block=THREADS)
+            launch(torch.cuda.current_stream(self.device), config, self._code.get_kernel(kernel), *arguments)
