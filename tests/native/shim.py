@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -18,10 +19,10 @@ AT_ONCE = 2  # threads that solve problems: the memory of one serves others afte
 
 
 @cache
-def compiled(text: str, *flags: str) -> ctypes.CDLL:
+def compiled(text: str) -> ctypes.CDLL:
     with TemporaryDirectory() as room:
         (Path(room) / "kernels.cu").write_text(text + SET_THREAD)
-        words = ["g++", *FLAGS, *(flags or ("-Og",)), "-w", "-x", "c++", "kernels.cu", "-o", "kernels.so"]
+        words = ["g++", *FLAGS, *os.environ.get("SHIM_FLAGS", "-Og").split(), "-w", "-x", "c++", "kernels.cu", "-o", "kernels.so"]
         done = subprocess.run(words, cwd=room, capture_output=True, text=True)
         assert done.returncode == 0, "\n".join(line for line in done.stderr.splitlines() if "error" in line)[:4000]
         return ctypes.CDLL(str(Path(room) / "kernels.so"))
@@ -32,6 +33,7 @@ class Shim:
 
     Args:
         stride: problems whose numbers are interleaved, where threads have problems.
+        free: bytes of memory.
 
     Attributes:
         launched: the kernels.
@@ -39,12 +41,13 @@ class Shim:
 
     device, multiprocessors = torch.device("cpu"), 1
 
-    def __init__(self, text: str, stride: int = WARP, *flags: str) -> None:
+    def __init__(self, text: str, stride: int = WARP, free: int = 1 << 28) -> None:
         text = text.replace(f"#define STRIDE {WARP}\n", f"#define STRIDE {stride}\n")
-        self._library, self.launched = compiled(text, *flags), list[str]()
+        self._library, self.launched = compiled(text), list[str]()
+        self._free = free
 
     def free_bytes(self) -> int:
-        return 1 << 28
+        return self._free
 
     def launch(self, kernel: str, blocks: int, *arguments: int) -> None:
         self.launched.append(kernel)
