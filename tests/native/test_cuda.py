@@ -75,7 +75,7 @@ def test_solves_have_the_bits_of_c(name: str, solver: str, stride: int) -> None:
     expected = torchgco.solve(FORMS[name](), solver=solver, verbose=False)
     with shimmed(stride=stride) as shims:
         found = torchgco.solve(FORMS[name](), solver=solver, verbose=False)
-    assert shims.launched & {"kernel_tgco_outer", "kernel_tgco_interior"}
+    assert shims.launched
     for bits in BITS:
         assert torch.equal(getattr(found, bits), getattr(expected, bits)), bits
 
