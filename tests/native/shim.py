@@ -22,7 +22,8 @@ AT_ONCE = 2  # threads that solve problems: the memory of one serves others afte
 def compiled(text: str) -> ctypes.CDLL:
     with TemporaryDirectory() as room:
         (Path(room) / "kernels.cu").write_text(text + SET_THREAD)
-        words = ["g++", *FLAGS, *os.environ.get("SHIM_FLAGS", "-Og").split(), "-w", "-x", "c++", "kernels.cu", "-o", "kernels.so"]
+        flags = *FLAGS, *os.environ.get("SHIM_FLAGS", "-Og").split(), "-w"
+        words = ["g++", *flags, "-x", "c++", "kernels.cu", "-o", "kernels.so"]
         done = subprocess.run(words, cwd=room, capture_output=True, text=True)
         assert done.returncode == 0, "\n".join(line for line in done.stderr.splitlines() if "error" in line)[:4000]
         return ctypes.CDLL(str(Path(room) / "kernels.so"))

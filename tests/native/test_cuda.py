@@ -108,7 +108,8 @@ def test_a_problem_of_a_device_is_served_there(monkeypatch) -> None:
     """Without a warning, and back where it came from."""
     problem, U0 = problem_of("cpu")
     expected, shims = torchgco.solve(problem, U0, "interior_point", verbose=False), Shims()
-    monkeypatch.setattr(elsewhere, "on_device", lambda device: OnDevice(shims, 1) if device.type == OTHER.type else None)
+    served = OnDevice(shims, 1)
+    monkeypatch.setattr(elsewhere, "on_device", lambda device: served if device.type == OTHER.type else None)
     with SecondDevice():
         solution = torchgco.solve(*problem_of(OTHER), "interior_point", verbose=False)
         assert solution.X.device == OTHER and numbers(solution) == numbers(expected)
@@ -159,10 +160,8 @@ def test_structures_on_a_device_point_to_what_lies_there() -> None:
     assert both.tolist() == [8.0] * 4 and lam.tolist() == [8.0] * 2 and given.tolist() == [1.0] * 3
 
 
-ALL = replace(
-    SOLVER,
-    functions=SOLVER.functions | {f"tgco_{name}": "Problem" for name in ("gains", "costates", "follow", "lift", "expand")},
-)
+OTHERS = "gains", "costates", "follow", "lift", "expand"  # functions that have no kernel, and could
+ALL = replace(SOLVER, functions=SOLVER.functions | {f"tgco_{name}": "Problem" for name in OTHERS})
 STRICT = "-std=c++20", "-pedantic-errors", "-Werror=vla", "-fsyntax-only"
 
 
@@ -184,9 +183,14 @@ def test_no_file_of_c_has_what_cuda_refuses(program: Program, name: str) -> None
     assert not errors(program, name)
 
 
-@pytest.mark.parametrize(
-    "line", ["void f(int n) { double a[n]; a[0] = 0; }", "Array f(void) { return (Array){.size = 1}; }", "int *p = malloc(4);"]
-)  # fmt: skip
+REFUSED = (
+    "void f(int n) { double a[n]; a[0] = 0; }",
+    "Array f(void) { return (Array){.size = 1}; }",
+    "int *p = malloc(4);",
+)
+
+
+@pytest.mark.parametrize("line", REFUSED)
 def test_what_cuda_refuses_is_seen(line: str) -> None:
     assert errors(SAMPLER, "tgco_sample", line)
 
@@ -210,8 +214,12 @@ try:
 except (ImportError, RuntimeError):  # the package, or its library
     NVRTC = ""
 needs_nvrtc = pytest.mark.skipif(not NVRTC, reason="no NVRTC")
-COMPILED = [("quadrotor", SAMPLER, "tgco_sample"), ("smooth", SOLVER, "tgco_outer"), ("a network", SOLVER, "tgco_outer"),
-            ("a body", INTERIOR, "tgco_interior")]  # fmt: skip
+COMPILED = [
+    ("quadrotor", SAMPLER, "tgco_sample"),
+    ("smooth", SOLVER, "tgco_outer"),
+    ("a network", SOLVER, "tgco_outer"),
+    ("a body", INTERIOR, "tgco_interior"),
+]
 
 
 @needs_nvrtc

@@ -32,7 +32,8 @@ TYPES = {
 }  # fmt: skip
 # Files of the kernels, and what takes their places.
 REPLACED = {
-    "vectors.h": C / "scalar" / "vectors.h", "wide.h": C / "scalar" / "wide.h", "allocation.h": HERE / "arena.h", "clock.h": HERE / "seconds.h",
+    "vectors.h": C / "scalar" / "vectors.h", "wide.h": C / "scalar" / "wide.h",
+    "allocation.h": HERE / "arena.h", "clock.h": HERE / "seconds.h",
 }  # fmt: skip
 FILES = "riccati.c", "interior.c", "sweep.h", "rollout.h"  # the interior point, sweeps and rollouts
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane

@@ -113,8 +113,8 @@ def kept_by(structure: Structure) -> dict[int, Any]:
         elif isinstance(one, Tensor):
             found.setdefault(one.data_ptr(), one)
         elif isinstance(one, (ctypes.Structure, ctypes.Array)):
-            if found.setdefault(ctypes.addressof(one), one) is one and isinstance(one, Structure):
-                todo += one.kept
+            known = found.setdefault(ctypes.addressof(one), one)
+            todo += one.kept if known is one and isinstance(one, Structure) else []
     return found
 
 

@@ -97,7 +97,7 @@ class Engine:
         """A further library of this form, which this engine and those with other shared numbers keep.
 
         Args:
-            of_device: a `Program`, and the type of its numbers, of which a library is made where functions run on a device.
+            of_device: a `Program`, and the type of its numbers, for a library of a device.
         """
         device = current()
         key = device, name

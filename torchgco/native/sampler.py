@@ -27,7 +27,9 @@ class Sampler:
 
     def __init__(self, engine: Engine, dtype: torch.dtype) -> None:
         self.engine = engine
-        self.library = engine.further(dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]), cuda.SAMPLER, REALS[dtype][0])
+        self.library = engine.further(
+            dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]), cuda.SAMPLER, REALS[dtype][0]
+        )
 
     def improve(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         """See `kernels.in_pytorch.Kernels.sample`."""

@@ -22,6 +22,7 @@ LANES = lanes()
 FEW_LANES = 2, 4  # lanes of libraries for few problems: lanes without a problem take time, too
 LIBRARIES_KEPT = 64  # libraries, the most recent ones
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
+OFFERED = "TGCO_BETWEEN_UNITS"  # of functions that other units call
 LOOPS = """
 static inline V entry(int e, IN f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
 static void tgco_gather(IN ALONE P, IN ALONE f, OUT ALONE T) {
@@ -129,7 +130,8 @@ class Form:
         sizes = kept | self._sizes | _space(self.position)
         sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none
         files = "model.c", self._cost_file, *files
-        return joined(defines(sizes) + included("structures.h") + declared + included(*files), given=texts | dict(given))
+        text = defines(sizes) + included("structures.h") + declared + included(*files)
+        return joined(text, given=texts | dict(given))
 
     @property
     def _sizes(self) -> dict[str, Any]:
@@ -259,8 +261,10 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
     arguments = "int i, IN x, IN u, IN p, const double *w"
     return "\n".join(
         (
-            switch(f"TGCO_BETWEEN_UNITS void model_rows({arguments}, OUT c)", values),
-            switch(f"TGCO_BETWEEN_UNITS void model_add_rows(\n    {arguments}, IN by_c, IN by_cc,\n    OUT g, OUT H)", adds),
-            switch(f"TGCO_BETWEEN_UNITS int model_slopes(\n    {arguments}, OUT e, const int **columns)", slopes, "    return 0;"),
+            switch(f"{OFFERED} void model_rows({arguments}, OUT c)", values),
+            switch(f"{OFFERED} void model_add_rows(\n    {arguments}, IN by_c, IN by_cc,\n    OUT g, OUT H)", adds),
+            switch(
+                f"{OFFERED} int model_slopes(\n    {arguments}, OUT e, const int **columns)", slopes, "    return 0;"
+            ),
         )
     )

@@ -1,10 +1,10 @@
-"""CUDA C++ to a program on a device: NVRTC compiles it, through cuda-core, and the cache keeps it for the next process."""
+"""CUDA C++ to a program on a device, by NVRTC through cuda-core; the cache keeps it for the next process."""
 
 from __future__ import annotations
 
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
 
 import torch
 
@@ -49,19 +49,15 @@ def cubin(text: str, arch: str) -> bytes:
 
 def _version() -> str:
     try:
-        from cuda.bindings import nvrtc
-
-        return ".".join(map(str, nvrtc.nvrtcVersion()[1:]))
+        return ".".join(map(str, import_module("cuda.bindings.nvrtc").nvrtcVersion()[1:]))
     except (ImportError, RuntimeError) as error:  # the latter: its library isn't found
         raise NativeError(f"no NVRTC found: {str(error).splitlines()[0]}; `pip install torchgco[cuda]`") from error
 
 
 def _compiled(text: str, arch: str) -> bytes:
-    from cuda.core import Program, ProgramOptions
-
+    core = import_module("cuda.core")
     try:
-        options: Any = ProgramOptions(arch=arch, **OPTIONS)
-        return bytes(Program(text, "c++", options).compile("cubin").code)
+        return bytes(core.Program(text, "c++", core.ProgramOptions(arch=arch, **OPTIONS)).compile("cubin").code)
     except Exception as error:  # NVRTCError, which cuda-core exports nowhere
         if type(error).__name__ != "NVRTCError":
             raise
@@ -77,25 +73,23 @@ class Loaded:
     """
 
     def __init__(self, text: str, device: torch.device) -> None:
-        from cuda.core import Device, ObjectCode
-
+        self._core = import_module("cuda.core")
         index = torch.cuda.current_device() if device.index is None else device.index
         self.device = torch.device("cuda", index)
         torch.zeros(1, device=self.device)  # PyTorch's context, which its tensors are in
-        self._device = Device(index)
+        self._device = self._core.Device(index)
         with torch.cuda.device(self.device):
             self._device.set_current()
             self.multiprocessors = int(self._device.properties.multiprocessor_count)
-            self._code = ObjectCode.from_cubin(cubin(text, f"sm_{self._device.arch}"))
+            self._code = self._core.ObjectCode.from_cubin(cubin(text, f"sm_{self._device.arch}"))
 
     def free_bytes(self) -> int:
         free, _ = torch.cuda.mem_get_info(self.device)
         return free + torch.cuda.memory_reserved(self.device) - torch.cuda.memory_allocated(self.device)
 
     def launch(self, kernel: str, blocks: int, *arguments: int) -> None:
-        from cuda.core import LaunchConfig, launch
-
+        config = self._core.LaunchConfig(grid=blocks, block=THREADS)
         with torch.cuda.device(self.device):
             self._device.set_current()
-            config = LaunchConfig(grid=blocks, block=THREADS)
-            launch(torch.cuda.current_stream(self.device), config, self._code.get_kernel(kernel), *arguments)
+            stream = torch.cuda.current_stream(self.device)
+            self._core.launch(stream, config, self._code.get_kernel(kernel), *arguments)

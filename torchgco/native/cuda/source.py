@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torchgco.native.codegen.source import Form
 from torchgco.native.includes import C
@@ -59,7 +60,7 @@ def source(form: Form, program: Program, name: str, real: str = "double") -> str
     given = {name: path.read_text() for name, path in OF_ONE.items()}
     given |= {name: (HERE / name).read_text() for name in ON_DEVICE}
     given["pointers.h"] = given.pop("strided.h") if program.stride > 1 else (C / "pointers.h").read_text()
-    sizes = {"STRIDE": program.stride, "THREADS": THREADS, "SAMPLES": SAMPLES}
+    sizes: dict[str, Any] = {"STRIDE": program.stride, "THREADS": THREADS, "SAMPLES": SAMPLES}
     text = form.alone(program.files, given, REAL=real, **sizes) + HEADER.layout
     if "kernels.h" in program.files:
         text += f"KERNEL({program.functions[name]}, {name})\n"
