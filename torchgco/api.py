@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import partial
@@ -136,12 +137,10 @@ def solve(
     with served_by(asked):
         problem, U0 = spared(problem, partial(_start, warm, solver, U0))
         multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
-        watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-        try:
-            found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
-            watcher.end(found)
-        finally:
-            watcher.close()
+        watched = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
+        with closing(watched):
+            found = solver.solve(problem, U0, seed, ids, multipliers, watched.callback, max_seconds, X0)
+            watched.end(found)
         _warn(problem, found, warm is None)
         problem, found = _returned(asked, problem, found, name)
         return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
