@@ -120,7 +120,7 @@ class CasADiSolver(Solver, named="solver"):
             "structure_detection": "manual",  # the stages are known: nothing to guess
             "N": problem.N,
             "nx": [problem.n] * (problem.N + 1),
-            "nu": [problem.m] * problem.N + [0],
+            "nu": [problem.m + program.unknowns.size2_out(0)] * problem.N + [0],
             "ng": program.path_rows,
             "equality": program.equality,
         }
@@ -190,8 +190,7 @@ class PreparedCasADi(Solver):
         n, size = X0.shape[-1], self.program.variables.numel()
         p = self.program.values(self.problem, b)
         lower, upper = self.program.limits.bounds(p, size)
-        stages = torch.cat((X0[:-1], U0), dim=-1).flatten()
-        guess = torch.cat((stages, X0[-1])).double().cpu().numpy()
+        guess = self._guess(X0, U0, p)
         highest = np.zeros(len(self.program.equality))
         lowest = np.where(self.program.equality, 0.0, -np.inf)
 
@@ -213,7 +212,18 @@ class PreparedCasADi(Solver):
         v = torch.from_numpy(result).to(U0).view(U0.shape[0], -1)
         at_limit = iterations >= self.solver.max_iterations
         failed = Status.MAX_ITERATIONS if at_limit else Status.LINE_SEARCH_FAILED
-        return v[0, :n], v[:, n:], (Status.CONVERGED if success else failed, iterations)
+        return v[0, :n], v[:, n : n + U0.shape[-1]], (Status.CONVERGED if success else failed, iterations)
+
+    def _guess(self, X0: Tensor, U0: Tensor, p: np.ndarray) -> np.ndarray:
+        """All variables, of parameters p: the unknowns of implicit steps where Newton's method begins."""
+        count = self.program.unknowns.size2_out(0)
+
+        def placed(unknowns: Tensor) -> np.ndarray:
+            stages = torch.cat((X0[:-1], U0, unknowns), dim=-1).flatten()
+            return torch.cat((stages, X0[-1])).double().cpu().numpy()
+
+        v = placed(U0.new_zeros(len(U0), count))
+        return placed(torch.as_tensor(np.asarray(self.program.unknowns(v, p))).to(U0)) if count else v
 
 
 def _refused(plugin: str, error: Exception) -> InputError:

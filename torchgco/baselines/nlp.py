@@ -1,7 +1,8 @@
 """A Problem as one nonlinear program of CasADi by multiple shooting, built once for the whole batch.
 
 Variables are ordered by stage, [x_0, u_0, x_1, u_1, ..., x_N], and so are the rows: x_{k+1} - step(x_k, u_k) first,
-then the constraint rows of knot k. Interior-point solvers for optimal control find their blocks by this order.
+then the constraint rows of knot k. Interior-point solvers for optimal control find their blocks by this order. The
+unknowns of an implicit step are variables after u_k, and its equations rows of knot k: direct collocation.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement, apart
 from torchgco.constraints.bounds import LOOSE
+from torchgco.dynamics.integrators import IMPLICIT
 from torchgco.native.codegen.dynamics import elements
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
+from torchgco.tracing.nets import Call
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Program:
     path_rows: list[int]  # number of rows of each knot 0..N, without x_{k+1} - step(x_k, u_k)
     limits: _Limits
     free: list[bool]  # which components of x_0 are variables
+    unknowns: ca.Function  # of v and p: guesses (N, q) of the unknowns of implicit steps
     sources: tuple[Traced, ...]
 
     def values(self, problem: Problem, b: int) -> np.ndarray:
@@ -91,13 +95,12 @@ def transcribe(problem: Problem) -> Program:
     N, n, m = problem.N, problem.n, problem.m
     step, cost, constraints = _traces(problem)
     sources = (step, cost, *constraints)
-    variables = ca.SX.sym("v", N * (n + m) + n)
     start = ca.SX.sym("x0", n)
     symbols = [ca.SX.sym(f"p{i}", source.count) for i, source in enumerate(sources)]
-    stages = [k * (n + m) for k in range(N + 1)]
-    x = [variables[i : i + n] for i in stages]
-    u = [variables[i + n : i + n + m] for i in stages[:-1]]
+    x, u = [ca.SX.sym(f"x{k}", n) for k in range(N + 1)], [ca.SX.sym(f"u{k}", m) for k in range(N)]
     X, U = np.stack([elements(z) for z in x])[None], np.stack([elements(z) for z in u])[None]
+    ahead, calls = _ahead(problem, step, symbols[0], X, U)
+    variables = ca.vertcat(*(ca.vertcat(*z) for z in zip(x, u, map(_unknowns, calls), strict=False)), x[-1])
 
     at_knot: list[list[tuple[ca.SX, bool]]] = [[] for _ in range(N + 1)]  # rows, and whether each is an equality
     free = _free(problem)
@@ -106,17 +109,21 @@ def transcribe(problem: Problem) -> Program:
         values = traced(elements(p), X, U)[0]
         for k, rows in zip(_knots(constraint.knots, N), values, strict=True):
             at_knot[k] += [(row, constraint.sense == "equality") for row in rows]
+    for k, of_stage in enumerate(calls):
+        at_knot[k] += [(row, True) for call in of_stage for row in elements(call.inputs[: call.net.size])]
+    guesses = [ca.vertcat(ca.SX(0, 1), *(call.inputs[call.net.size :] for call in of_stage)) for of_stage in calls]
     parameters = ca.vertcat(start, *symbols)
     limits, at_knot = _limits(at_knot, variables, parameters)
 
-    rows, equality, ahead = [], [], _ahead(problem, step, symbols[0], X, U)
+    rows, equality = [], []
     for k in range(N + 1):
         gap = [(row, True) for row in elements(x[k + 1] - ahead[k])] if k < N else []
         rows += [row for row, _ in gap + at_knot[k]]
         equality += [is_equality for _, is_equality in gap + at_knot[k]]
     return Program(
         variables, parameters, _column(cost(elements(symbols[1]), X, U)), _column(rows), equality,
-        [len(knot) for knot in at_knot], limits, free, sources,
+        [len(knot) for knot in at_knot], limits, free,
+        ca.Function("unknowns", [variables, parameters], [ca.horzcat(*guesses).T]), sources,
     )  # fmt: skip
 
 
@@ -131,13 +138,14 @@ def _free(problem: Problem) -> list[bool]:
 
 def _traces(problem: Problem) -> tuple[Traced, Traced, list[Traced]]:
     X, U = problem.x0.new_zeros(1, problem.N + 1, problem.n), problem.x0.new_zeros(1, problem.N, problem.m)
+    at_all = _changes(problem) or problem.dynamics.integrator in IMPLICIT
 
     def trace(field: str, part: PerElement, method: str, *examples: Tensor) -> Traced:
         part = apart(part)
         return Traced(field, lambda i, *z: getattr(part.take(i), method)(*z), *examples, own=own_tensors(part))
 
     return (
-        trace("dynamics.step", problem.along, "step", *((X[:, :-1], U) if _changes(problem) else (X[:, 0], U[:, 0]))),
+        trace("dynamics.step", problem.along, "step", *((X[:, :-1], U) if at_all else (X[:, 0], U[:, 0]))),
         trace("cost", problem.cost, "total", X, U),
         [trace(f"constraints[{i}] ({type(c).__name__})", c, "value", X, U) for i, c in enumerate(problem.constraints)],
     )
@@ -148,13 +156,24 @@ def _changes(problem: Problem) -> bool:
     return problem.along is not problem.dynamics
 
 
-def _ahead(problem: Problem, step: Traced, p: ca.SX, X: np.ndarray, U: np.ndarray) -> list[ca.SX]:
-    """step(x_k, u_k) of each stage, from X (1, N+1, n) and U (1, N, m)."""
+def _ahead(
+    problem: Problem, step: Traced, p: ca.SX, X: np.ndarray, U: np.ndarray
+) -> tuple[list[ca.SX], list[list[Call]]]:
+    """step(x_k, u_k) of each stage, from X (1, N+1, n) and U (1, N, m), and the roots in each."""
+    if step.has_roots:
+        roots: list[Call] = []
+        after = step(elements(p), X[:, :-1], U, calls=roots)[0]
+        return list(map(_column, after)), [roots[k :: problem.N] for k in range(problem.N)]
+    none: list[list[Call]] = [[] for _ in range(problem.N)]
     if _changes(problem):
-        return [_column(after) for after in step(elements(p), X[:, :-1], U)[0]]
+        return [_column(after) for after in step(elements(p), X[:, :-1], U)[0]], none
     first = [_column(z[0, 0]) for z in (X, U)]
     single = ca.Function("step", [*first, p], [_column(step(elements(p), X[:, 0], U[:, 0])[0])])
-    return [single(_column(x), _column(u), p) for x, u in zip(X[0], U[0], strict=False)]
+    return [single(_column(x), _column(u), p) for x, u in zip(X[0], U[0], strict=False)], none
+
+
+def _unknowns(roots: list[Call]) -> ca.SX:
+    return ca.vertcat(ca.SX(0, 1), *(root.outputs for root in roots))
 
 
 def _limits(

@@ -12,18 +12,20 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError
-from torchgco.base.options import Checked, Count, Seconds
+from torchgco.base.options import Checked, Count, Natural, Seconds
+from torchgco.base.roots import root
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.integrators import INTEGRATORS, Integrator
 
 
 class Dynamics(PerElement, Checked):
     """x_{k+1} = step(x_k, u_k) on (..., n), (..., m).
 
     A model is a subclass with the numbers `n` and `m`, and one method: `field(x, u)`, the time derivative of x, with
-    the attributes `dt` (s) and `integrator` ("euler", "midpoint" or "rk4"); or `step(x, u)` itself.
+    the attributes `dt` (s) and `integrator` ("euler", "midpoint" or "rk4", and for stiff fields "implicit_euler",
+    "radau3" or "radau5"); or `step(x, u)` itself.
 
         class Car(Dynamics):
             n, m, dt, integrator, position = 4, 2, 0.05, "midpoint", slice(0, 2)
@@ -128,6 +130,11 @@ class FunctionDynamics(Dynamics, named="dynamics"):
     The function may take an argument k (without a default): the number of the stage, or the numbers (K,) of the stages
     of x (B, K, n).
 
+    With algebraic equations 0 = g(x, z, u) of index 1, `algebraic` of them for as many algebraic states z, the function
+    is function(x, z, u) -> (x', g):
+
+        rod = FunctionDynamics(pulled, n=4, m=1, dt=0.05, integrator="radau5", algebraic=1)  # z: the force in the rod
+
     Args:
         dt: s, the same for all stages. Stages of different length: integrator="none", a function that makes a whole
             step, and its lengths in `knot_values`, named "dt" for `Solution.t`; obstacles that move then still count in
@@ -137,6 +144,7 @@ class FunctionDynamics(Dynamics, named="dynamics"):
             solve belong here, or in captured tensors: with another captured Python number the code is compiled again.
         knot_values: the same per stage, (B|1, N, ...); the function sees the rows of its stages, (B, ...), (B, K, ...)
             or (B, 1, ...).
+        algebraic: number of algebraic states. Newton's method seeks them from 0; the step is NaN where it finds none.
         state_names, state_units, control_names, control_units: see `Dynamics`.
 
     Raises:
@@ -148,11 +156,12 @@ class FunctionDynamics(Dynamics, named="dynamics"):
     n: Count
     m: Count
     dt: Seconds
-    integrator: Literal["euler", "midpoint", "rk4", "none"] = "euler"
+    integrator: Integrator | Literal["none"] = "euler"
     position: slice | None = None
     values: Any = None
     knot_values: Any = None
     k: Any = hidden(default=None, repr=False)  # the stage or the stages (K,), set by `at`
+    algebraic: Natural = hidden(default=0, kw_only=True)
     state_names: Sequence[str] = hidden(default=(), kw_only=True)
     state_units: Sequence[str] = hidden(default=(), kw_only=True)
     control_names: Sequence[str] = hidden(default=(), kw_only=True)
@@ -162,6 +171,8 @@ class FunctionDynamics(Dynamics, named="dynamics"):
     calls_function: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Self:
+        if self.algebraic and not self.is_integrated:
+            raise InputError("dynamics.integrator", "an integrator, for algebraic states", "none")
         values = bound_values(self.values, self.knot_values, (self.function,), dims, "dynamics", knots=dims.N)
         return replace(self, values=values)
 
@@ -177,12 +188,26 @@ class FunctionDynamics(Dynamics, named="dynamics"):
         return self.integrator != "none"
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
-        return self._called(x, u)
+        return self._equations(x, self.algebraic_states(x, u), u)[0] if self.algebraic else self._called(x, u)
+
+    def algebraic_states(self, x: Tensor, u: Tensor) -> Tensor:
+        """The algebraic states z (..., q) at states x (..., n) with controls u (..., m): where g(x, z, u) = 0."""
+        guess = x.new_zeros(*x.shape[:-1], self.algebraic)
+        return root(lambda z: self._equations(x, z, u)[1], guess)
+
+    def _equations(self, x: Tensor, z: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """x' and g."""
+        values = self._called(x, z, u)
+        shapes = [tuple(value.shape) for value in values] if isinstance(values, tuple) else type(values).__name__
+        expected = [(*x.shape[:-1], size) for size in (self.n, self.algebraic)]
+        if shapes != expected:
+            raise InputError("dynamics.function", f"x' and g of shapes {expected[0]} and {expected[1]}", shapes)
+        return values
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         return super().step(x, u) if self.is_integrated else self._called(x, u)
 
-    def _called(self, x: Tensor, u: Tensor) -> Tensor:
+    def _called(self, x: Tensor, *more: Tensor) -> Any:
         if self.k is None and self._depends_on_stage:
             raise InputError("dynamics", "a stage, as in `dynamics.at(k).step(x, u)`", "none")
-        return (self.values or NO_VALUES).call(self.function, x, u, k=self.k)
+        return (self.values or NO_VALUES).call(self.function, x, *more, k=self.k)

@@ -57,10 +57,7 @@ OFF_MAP = (
     "around it."
 )
 OTHER_GOAL = "A goal that no obstacle covers, or a larger radius of it."
-SHORTER_STEPS = (
-    'A smaller dt, or integrator="rk4" where it is another one. A stiff model takes an implicit step, '
-    'with integrator="none".'
-)
+SHORTER_STEPS = 'A smaller dt, or integrator="rk4" where it is another one; of a stiff model integrator="radau5".'
 KNOWN_START = (
     "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
     'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'

@@ -22,16 +22,17 @@ from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import LEAST_COST
 
-ORDER_OF = {"euler": 1, "midpoint": 2, "rk4": 4}
-# Step errors above these are large. Euler's difference is a quarter of the second difference of the states, half of
-# their range at most, which controls that change at every stage come close to without a stiff model.
-LARGE_ERROR = {"euler": 0.5, "midpoint": 0.1, "rk4": 0.1}
+ORDER_OF = {"euler": 1, "implicit_euler": 1, "midpoint": 2, "radau3": 3, "rk4": 4, "radau5": 5}
+LARGE_ERROR = 0.1  # step errors above this are large
+# The same of order 1. Euler's difference is a quarter of the second difference of the states, half of their range at
+# most, which controls that change at every stage come close to without a stiff model.
+LARGE_OF_FIRST = 0.5
 LARGE_COST = 0.01  # step costs above this are large
 # A method of order p changes the cost by c / N^p where nothing changes faster than within the whole duration: up to so
 # much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
 COARSE = 2.5
-# Step errors up to which no step cost is doubted: whoever takes Euler steps takes errors that add up.
-HARMLESS_ERROR = {"euler": 0.05, "midpoint": 0.0, "rk4": 0.0}
+# Step errors of order 1 up to which no step cost is doubted: whoever takes Euler steps takes errors that add up.
+HARMLESS_OF_FIRST = 0.05
 LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
 LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
@@ -78,7 +79,7 @@ def step_errors(
         times: (B, N+1), s, of the knots where the time is free.
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
-            all stages together to be large, or no error is above `HARMLESS_ERROR`.
+            all stages together to be large, or no error of order 1 is above `HARMLESS_OF_FIRST`.
         costates: finds them, or returns None where autodiff has to; None: it always has.
     """
     lost = X.new_full((problem.B,), torch.nan)
@@ -86,6 +87,7 @@ def step_errors(
     error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), torch.zeros_like(zeros, dtype=torch.bool))
     if not _halves(problem):
         return error
+    order = ORDER_OF[problem.dynamics.integrator]
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
             e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
@@ -94,7 +96,7 @@ def step_errors(
             asked = torch.isfinite(worst)
             if doubted:
                 asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
-                asked &= worst > HARMLESS_ERROR[problem.dynamics.integrator]
+                asked &= worst > (HARMLESS_OF_FIRST if order == 1 else 0.0)
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             chosen = asked.nonzero().flatten()
             if chosen.numel() > 0:
@@ -104,9 +106,9 @@ def step_errors(
                     problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()], costates
                 )
             error.step_cost[rows] = costs
-        method, stages = problem.dynamics.integrator, problem.stages.to(X.dtype)
-        too_much = (COARSE / stages ** ORDER_OF[method]).clamp(min=LARGE_COST)
-        error.large[:] = (error.step_error > LARGE_ERROR[method]) | (error.step_cost > too_much)
+        too_much = (COARSE / problem.stages.to(X.dtype) ** order).clamp(min=LARGE_COST)
+        large = LARGE_OF_FIRST if order == 1 else LARGE_ERROR
+        error.large[:] = (error.step_error > large) | (error.step_cost > too_much)
     return error
 
 

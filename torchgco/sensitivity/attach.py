@@ -69,9 +69,9 @@ def _captures(problem: Problem) -> bool:
     if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
         return False
     single = problem.take(slice(0, 1))
-    X, U = (z.detach() for z in single.at_rest)
+    model, (X, U) = single.along, (z.detach() for z in single.at_rest)
     uses: list[tuple[object, Callable[[], Tensor]]] = [
-        (single.dynamics, lambda: single.along.step(X[:, :-1], U)),
+        (single.dynamics, lambda: (model.field if model.is_integrated else model.step)(X[:, :-1], U)),
         (single.cost, lambda: single.cost.total(X, U)),
         *((row, lambda row=row: row.value(X, U)) for row in single.constraints),
     ]

@@ -87,9 +87,12 @@ class Net:
 
 @dataclass(frozen=True)
 class Call:
-    """A network at one point: CasADi's columns of its inputs (k), expressions, and of its outputs, symbols."""
+    """A network at one point: CasADi's columns of its inputs (k), expressions, and of its outputs, symbols.
 
-    net: Net
+    In its place may be the root of an equation, `tracing.roots.Root`.
+    """
+
+    net: Any
     inputs: Any
     outputs: Any
 

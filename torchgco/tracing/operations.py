@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchgco.base.roots import SOLVED, UNKNOWN
 from torchgco.tracing import arrays
 from torchgco.tracing.arrays import NoCounterpart, boxed
 
@@ -94,6 +95,10 @@ def _divide(a: Any, b: Any, rounding_mode: str | None = None) -> np.ndarray:
         return _floor_divided(a, b)
     quotient = _truediv(a, b)
     return quotient if rounding_mode is None else _where(_lt(quotient, 0.0), _unary("ceil")(quotient), _floor(quotient))
+
+
+def _no_formula() -> Any:
+    raise NoCounterpart("an implicit step has no formula")
 
 
 def _excess(a: Any, b: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -392,4 +397,7 @@ OPERATIONS: dict[str, Callable] = {
     "aten.full_like": lambda a, value, **_: _full(value, a),
     **{f"aten.new_{name}": functools.partial(_full, value) for name, value in FILLED.items()},
     "aten.new_full": lambda a, size, value, **_: _full(value, a, size),
+    # the root of an equation, which `Traced` keeps whole
+    UNKNOWN: lambda guess: _no_formula(),
+    SOLVED: lambda unknown, residual: _no_formula(),
 }

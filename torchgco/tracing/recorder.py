@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
+from torchgco.base.roots import roots_as_operations
 from torchgco.base.shapes import MISTAKES
 from torchgco.tracing.decompositions import DECOMPOSITIONS
 from torchgco.tracing.operations import OPERATIONS
@@ -258,7 +259,7 @@ def looks_at_values(function: Callable[..., Tensor], *examples: Tensor) -> bool:
     recording = Recording(examples, calls)
     recording.lenient = True
     try:
-        with torch.no_grad(), recording, calls:
+        with torch.no_grad(), roots_as_operations(), recording, calls:
             torch.func.functionalize(function, remove="mutations")(*examples)
     except MISTAKES:
         pass
@@ -311,7 +312,7 @@ def take_same_branches(call: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
 def _read(function: Callable[..., Tensor], *arguments: Any) -> tuple[list[Any], list[Any]]:
     """What Python code reads, None for what can't be followed; and the operations with numbers that it calls."""
     calls, reading = WithoutReading(), _Reading(arguments)
-    with torch.no_grad(), reading, calls:
+    with torch.no_grad(), roots_as_operations(), reading, calls:
         function(*arguments)
     return [*reading.values, *(tensor.tolist() for tensor in calls.read)], reading.path
 
@@ -333,7 +334,7 @@ def record(field: str, function: Callable[..., Tensor], *examples: Tensor) -> Re
     # Writes in place become writes into a copy: PyTorch's part and CasADi's must not share memory.
     pure = torch.func.functionalize(function, remove="mutations")
     try:
-        with torch.no_grad(), recording, calls:
+        with torch.no_grad(), roots_as_operations(), recording, calls:
             result = pure(*examples)
         if (caught := recording.unfit or calls.refused) is not None:
             raise caught

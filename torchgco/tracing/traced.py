@@ -27,6 +27,7 @@ from torchgco.tracing.nets import MOST_WEIGHTS, Call, Nets
 from torchgco.tracing.operations import OPERATIONS
 from torchgco.tracing.picks import followers, indices, needed, picks_of
 from torchgco.tracing.recorder import Operation, Recording, Slot, name_of, record, replay_all
+from torchgco.tracing.roots import Equations, Roots
 
 STRUCTURAL = 0.0, 1.0, -1.0  # numbers that change the form of expressions
 
@@ -112,7 +113,10 @@ class Traced:
         varying = followers(self._plain, [self._index, *self._named])
         reached = followers(self._plain, read) - varying
         shared = [slot for slot in self._border if slot in reached and slot.dtype.is_floating_point]
-        self._nets = Nets(self._symbolic, recording.shapes, shared, self._result)
+        self._roots = Roots(self._symbolic)
+        # A network within an equation is evaluated wherever the equation is: as scalars, with it.
+        layered = [] if self._roots else self._symbolic
+        self._nets = Nets(layered, recording.shapes, shared, self._result)
         if self._nets.size > MOST_WEIGHTS:
             expected = f"networks of at most {MOST_WEIGHTS} weights in native kernels"
             raise InputError(self.field, expected, self._nets.size)
@@ -229,6 +233,11 @@ class Traced:
         return picks_of(operations, own, self._own, self._index, self._captured, self._indexed)
 
     @property
+    def has_roots(self) -> bool:
+        """Whether roots of equations are among its operations: only with `calls` it can be replayed."""
+        return bool(self._roots)
+
+    @property
     def named(self) -> list[int]:
         """The places of the tensors in `own` that the function reads."""
         return list(self._named.values())
@@ -290,8 +299,8 @@ class Traced:
             variables: shaped as the examples.
             constants: (c,), used in place of `self.constants`, which are the default.
             shared: (s,), used in place of the first `shared_numbers` when it was traced, which are the default.
-            calls: networks stay whole and are added to it, in order; None: they are computed like all else, with the
-                weights that they had when it was traced.
+            calls: networks and roots stay whole and are added to it, in order; None: networks are computed like all
+                else, with the weights that they had when it was traced.
 
         Raises:
             InputError: an operation that CasADi has no counterpart for with these arguments.
@@ -303,10 +312,13 @@ class Traced:
             known |= _placed(constants, {slot: self._constants[slot].shape for slot in self._replaceable})
         if calls is None:
             known |= self._weights
+        equations = Equations()
         for net, operation in self._nets.steps(self._symbolic, calls is not None):
             try:
                 if net is not None and calls is not None:
                     self._nets.call(net, known, len(self.pattern), self._precision, calls)
+                elif calls is not None and operation in self._roots:
+                    self._roots.take(operation, known, equations, calls)
                 else:
                     replay(operation, known, self._precision)
             except NoCounterpart as error:

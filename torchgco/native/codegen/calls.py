@@ -1,4 +1,4 @@
-"""Expressions with calls of networks in them: their derivatives, and their C.
+"""Expressions with calls in them, of networks and of roots of equations: their derivatives, and their C.
 
 Between the calls lie expressions of scalars. C computes the inputs of a call, then the call, and so on; what a call
 gives (outputs, tangents, products with its Jacobian, second derivatives) are symbols in all that comes after it.
@@ -13,19 +13,47 @@ from typing import Any
 from torchgco.base.errors import InputError
 from torchgco.native.codegen import emit
 from torchgco.native.codegen.layers import NetSource
+from torchgco.native.codegen.roots import Back, Newton, Slopes
 from torchgco.tracing.nets import Call
+from torchgco.tracing.roots import Root
 
-MOST_KEPT = 4_000_000  # bytes of the stack that the networks of a function may take
+MOST_KEPT = 4_000_000  # bytes of the stack that the calls of a function may take
 
 
 @dataclass(frozen=True)
-class Stage:
+class NetStage:
     """A function of a network in C: CasADi's columns of what it reads, expressions, and writes, symbols."""
 
     source: NetSource
     inputs: Any
     outputs: Any
     ahead: int | None  # of a product with the transposed Jacobian: the stage that went before it
+
+    @property
+    def reads(self) -> Any:
+        return self.inputs
+
+    @property
+    def kept_bytes(self) -> int:
+        return self.source.kept_bytes if self.ahead is None else 0
+
+    def helpers(self, name: str, symbols: Sequence[Any]) -> list[str]:
+        return [self.source.code, emit.function(name, symbols, self.inputs)]
+
+    def lines(self, name: str, i: int, passed: str) -> list[str]:
+        declared = [f"V a{i}[{self.inputs.numel()}], b{i}[{self.outputs.numel()}];", f"{name}({passed}, a{i});"]
+        key, w = self.source.key, f"in{emit.SHARED_AT}"
+        if self.ahead is not None:
+            to = f"b{i}, b{i} + {self.source.net.k}"
+            return [*declared, f"tgco_net_{key}_back({w}, kept{self.ahead}, a{i}, {to});"]
+        if not self.source.d:
+            return [*declared, f"tgco_net_{key}({w}, a{i}, b{i});"]
+        tangents = "0" if self.source.plain else f"a{i} + {self.source.net.k}"
+        called = f"tgco_net_{key}_ahead({w}, a{i}, {tangents}, b{i}, b{i} + {self.source.net.size}, kept{i});"
+        return [*declared, f"tgco_net_{key}_kept kept{i}[1];", called]
+
+
+Stage = NetStage | Newton | Slopes | Back
 
 
 class Ahead:
@@ -41,16 +69,23 @@ class Ahead:
         self.stages: list[Stage] = []
         self.columns: list[list[int]] = []  # of z, on which each call's inputs depend
         self.slopes: list[Any] = []  # of each call's outputs by z
+        self._places: list[int] = []  # of each call's first stage
         for i, call in enumerate(calls):
-            of_inputs = self.jacobian(call.inputs)
+            of_inputs = self.jacobian(_residual(call))
             columns, plain = _columns(of_inputs)
             tangents = ca.SX.sym(f"t{i}", call.outputs.numel(), len(columns))
             slopes = ca.SX(call.outputs.numel(), z.numel())
             if columns:
                 slopes[:, columns] = tangents
-            inputs = call.inputs if plain else ca.vertcat(call.inputs, ca.densify(ca.vec(of_inputs[:, columns])))
-            source = NetSource(call.net, len(columns), plain)
-            self.stages.append(Stage(source, inputs, ca.vertcat(call.outputs, ca.vec(tangents)), None))
+            self._places.append(len(self.stages))
+            along = ca.densify(ca.vec(of_inputs[:, columns]))
+            if isinstance(call.net, Root):
+                self.stages.append(Newton(call, derived=True))
+                self.stages.append(Slopes(self._places[-1], call.net.size, along, ca.vec(tangents)))
+            else:
+                inputs = call.inputs if plain else ca.vertcat(call.inputs, along)
+                source = NetSource(call.net, len(columns), plain)
+                self.stages.append(NetStage(source, inputs, ca.vertcat(call.outputs, ca.vec(tangents)), None))
             self.columns.append(columns)
             self.slopes.append(slopes)
 
@@ -83,9 +118,15 @@ class Ahead:
             by = ca.densify(ca.jacobian(total, call.outputs, {"allow_reverse": False})).T
             if not columns or by.is_zero():
                 continue
+            if isinstance(call.net, Root):
+                multipliers = ca.SX.sym(f"v{i}", call.net.size)
+                stages.append(Back(self._places[i], call.net.size, by, multipliers))
+                total += _product(multipliers.T, _residual(call), chooses(by))
+                continue
             back = ca.SX.sym(f"v{i}", call.inputs.numel())
             upper = ca.SX.sym(f"h{i}", len(columns) * (len(columns) + 1) // 2)
-            stages.append(Stage(self.stages[i].source, by, ca.vertcat(back, upper), i))
+            place = self._places[i]
+            stages.append(NetStage(self.stages[place].source, by, ca.vertcat(back, upper), place))
             pairs = [(p, q) for first, p in enumerate(columns) for q in columns[first:]]
             for (p, q), entry in zip(pairs, ca.vertsplit(upper), strict=True):
                 bent[p, q] += entry
@@ -130,9 +171,24 @@ def _columns(of_inputs: Any) -> tuple[list[int], bool]:
     return sorted(set(columns)), False
 
 
+def _residual(call: Call) -> Any:
+    """What a call's outputs depend on: a network's inputs, or an equation's residual."""
+    return call.inputs[: call.net.size] if isinstance(call.net, Root) else call.inputs
+
+
+def key_of(net: Any) -> str:
+    """What a call computes of its inputs."""
+    return f"root of {net.size}" if isinstance(net, Root) else NetSource(net, 0).key
+
+
 def values(calls: Sequence[Call]) -> list[Stage]:
     """Calls without derivatives."""
-    return [Stage(NetSource(call.net, 0), call.inputs, call.outputs, None) for call in calls]
+    return [
+        Newton(call, derived=False)
+        if isinstance(call.net, Root)
+        else NetStage(NetSource(call.net, 0), call.inputs, call.outputs, None)
+        for call in calls
+    ]
 
 
 def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages: Sequence[Stage]) -> str:
@@ -146,36 +202,21 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
     kept = _needed(stages, ca.vertcat(*outputs))
     if not kept:
         return emit.emit(name, ca.Function(name, [*inputs], [*outputs]), emit.SHARED_AT)
-    if (kept_bytes := sum(stages[i].source.kept_bytes for i in kept if stages[i].ahead is None)) > MOST_KEPT:
+    if (kept_bytes := sum(stages[i].kept_bytes for i in kept)) > MOST_KEPT:
         raise InputError("networks", f"derivatives of at most {MOST_KEPT} bytes in native kernels", kept_bytes)
     arguments = ", ".join(f"{emit.input_type(i)} in{i}" for i in range(len(inputs)))
     passed = ", ".join(f"in{i}" for i in range(len(inputs)))
-    helpers, declared, lines, symbols = [], [], [], [*inputs]
+    helpers, lines, symbols = [], [], [*inputs]
     for i in kept:
         stage = stages[i]
-        helpers.append(stage.source.code)
-        helpers.append(emit.emit(f"{name}_{i}", ca.Function(name, symbols, [stage.inputs]), emit.SHARED_AT))
-        declared.append(f"    V a{i}[{stage.inputs.numel()}], b{i}[{stage.outputs.numel()}];")
-        if stage.source.d and stage.ahead is None:
-            declared.append(f"    tgco_net_{stage.source.key}_kept kept{i}[1];")
-        lines += [f"    {name}_{i}({passed}, a{i});", f"    {_called(i, stage)};"]
+        helpers += stage.helpers(f"{name}_{i}", symbols)
+        lines += [f"    {line}" for line in stage.lines(f"{name}_{i}", i, passed)]
         symbols, passed = [*symbols, stage.outputs], f"{passed}, b{i}"
     helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED_AT))
     lines.append(f"    {name}_end({passed}, {', '.join(f'out{i}' for i in range(len(outputs)))});")
     written = ", ".join(f"OUT ALONE out{i}" for i in range(len(outputs)))
     head = f"TGCO_APART void {name}({arguments}, {written}) {{"
-    return "\n".join([*dict.fromkeys(helpers), head, *declared, *lines, "}\n"])
-
-
-def _called(i: int, stage: Stage) -> str:
-    """The call of stage i, from a to b."""
-    net, key, w = stage.source.net, stage.source.key, f"in{emit.SHARED_AT}"
-    if stage.ahead is not None:
-        return f"tgco_net_{key}_back({w}, kept{stage.ahead}, a{i}, b{i}, b{i} + {net.k})"
-    if stage.source.d:
-        tangents = "0" if stage.source.plain else f"a{i} + {net.k}"
-        return f"tgco_net_{key}_ahead({w}, a{i}, {tangents}, b{i}, b{i} + {net.size}, kept{i})"
-    return f"tgco_net_{key}({w}, a{i}, b{i})"
+    return "\n".join([*dict.fromkeys(helpers), head, *lines, "}\n"])
 
 
 def _needed(stages: Sequence[Stage], outputs: Any) -> list[int]:
@@ -187,7 +228,7 @@ def _needed(stages: Sequence[Stage], outputs: Any) -> list[int]:
         stage = stages[i]
         if i in kept or not wanted.isdisjoint(symbol.element_hash() for symbol in ca.symvar(stage.outputs)):
             kept.add(i)
-            wanted |= {symbol.element_hash() for symbol in ca.symvar(stage.inputs)}
+            wanted |= {symbol.element_hash() for symbol in ca.symvar(stage.reads)}
             if stage.ahead is not None:
                 kept.add(stage.ahead)
     return sorted(kept)

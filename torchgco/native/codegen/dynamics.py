@@ -16,8 +16,9 @@ from torch import Tensor
 from torchgco.base.tree import apart
 from torchgco.dynamics import Dynamics
 from torchgco.native import store
-from torchgco.native.codegen import calls, emit, layers
+from torchgco.native.codegen import calls, emit, layers, roots
 from torchgco.tracing import Traced, arrays, dtypes, nets, operations, own_tensors
+from torchgco.tracing import roots as traced_roots
 from torchgco.tracing.nets import Call
 
 RATIONAL = "INPUT", "OUTPUT", "CONST", "PARAMETER", "ASSIGN", "ADD", "SUB", "MUL", "DIV", "INV", "NEG", "TWICE", "SQ"
@@ -174,7 +175,7 @@ def elements(column: Any) -> np.ndarray:
 @cache
 def makers(*more: str) -> Sequence[str]:
     """Versions of CasADi and PyTorch and the texts of the files that generate code, which cached code depends on."""
-    modules = (operations, arrays, dtypes, nets, emit, layers, calls)
+    modules = (operations, arrays, dtypes, nets, traced_roots, emit, layers, calls, roots)
     files = (*(module.__file__ for module in modules), __file__, *more)
     try:
         casadi = version("casadi")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +54,13 @@ def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
     declared = [f"V {work};"] if work else []
     body = "\n".join(f"    {line}" for line in (*declared, *lines))
     return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
+
+
+def function(name: str, inputs: Sequence[Any], *outputs: Any) -> str:
+    """`emit` of CasADi's columns of inputs, symbols, and outputs, one array each."""
+    import casadi
+
+    return emit(name, casadi.Function("f", [*inputs], [casadi.cse(casadi.densify(o)) for o in outputs]), SHARED_AT)
 
 
 def input_type(i: int, shared: int | None = SHARED_AT) -> str:

@@ -19,8 +19,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.native import store
 from torchgco.native.codegen import emit
+from torchgco.native.codegen.calls import key_of
 from torchgco.native.codegen.dynamics import elements, makers
-from torchgco.native.codegen.layers import NetSource
 from torchgco.tracing import Traced
 from torchgco.tracing.nets import Call
 
@@ -133,7 +133,7 @@ def knot_parts(
         knot, places = _one_knot(span)
         made = [call.outputs for call in knot.calls]
         function = ca.Function("knot", [*knot.inputs, *made], [knot.rows, *(call.inputs for call in knot.calls)])
-        form = span.n, span.m, *_form(function), *(NetSource(call.net, 0).key for call in knot.calls)
+        form = span.n, span.m, *_form(function), *(key_of(call.net) for call in knot.calls)
         name = store.key_of((kind, str(form), *makers(__file__, *files)))[:16]
         return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "numbers_at": places}
 
@@ -239,7 +239,7 @@ class _Calls:
     def key(self, call: Call) -> str:
         """What a call computes."""
         if id(call.net) not in self._keys:
-            self._keys[id(call.net)] = NetSource(call.net, 0).key
+            self._keys[id(call.net)] = key_of(call.net)
         return self._keys[id(call.net)]
 
 

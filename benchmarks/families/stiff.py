@@ -1,0 +1,192 @@
+"""python -m benchmarks.families.stiff: stiff models and algebraic equations by implicit steps, beside IPOPT.
+
+The models are those that the literature tries stiff integrators on. What a plan says is compared with its controls
+flown by SciPy's Radau at 1e-9. Times are processor time of one thread; IPOPT's is its own, by collocation.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+
+import torchgco
+from benchmarks.lib.command import Command
+from benchmarks.lib.page import markdown
+from torchgco import ControlBounds, FunctionDynamics, InteriorPoint, Problem, QuadraticCost, Solution
+from torchgco.baselines import CasADiSolver
+
+HEAD = (
+    "model", "steps", "status", "iterations", "cost said", "cost flown", "off, %", "ms", "us an iteration",
+    "IPOPT: iterations", "its cost", "its ms",
+)  # fmt: skip
+METHODS = "rk4", "implicit_euler", "radau3", "radau5"
+STARTS = 32  # of which times are taken
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model and its problem; `guess`: of all controls."""
+
+    field: Callable[..., Any]
+    x0: list[float]
+    dt: float
+    N: int
+    bounds: tuple[float, float]
+    cost: dict[str, list[float]]
+    guess: float = 0.0
+    algebraic: int = 0
+
+    def problem(self, method: str, B: int = 1) -> Problem:
+        """B starts, of which the first is the case's own, the others up to 2 % off in all that isn't 0."""
+        x0 = torch.tensor([self.x0], dtype=torch.float64)
+        off = torch.rand(B, len(self.x0), dtype=torch.float64, generator=torch.Generator().manual_seed(5)) - 0.5
+        off[0] = 0.0
+        of_model = {"n": len(self.x0), "m": 1, "dt": self.dt, "integrator": method, "algebraic": self.algebraic}
+        model = FunctionDynamics(self.field, **of_model)
+        starts = x0 * (1.0 + 0.04 * off)
+        return Problem(model, QuadraticCost(**self.cost), [ControlBounds(*self.bounds)], starts, self.N)
+
+    def flown(self, problem: Problem, U: Tensor) -> float:
+        """The cost of a first problem's controls U (N, 1), each held for a stage, by SciPy's Radau."""
+        x, total, cost = problem.x0[:1], 0.0, problem.cost.take(slice(0, 1))
+        for k in range(problem.N):
+            u = U[k : k + 1]
+            total += float(cost.stage(x, u, k))
+            rates = lambda t, z, u=u: problem.dynamics.field(torch.tensor(z)[None], u)[0].numpy()
+            try:
+                end = solve_ivp(rates, (0.0, self.dt), x[0].numpy(), method="Radau", rtol=1e-9, atol=1e-11)
+            except ValueError:  # not finite
+                return np.nan
+            x = torch.tensor(end.y[:, -1])[None]
+        return total + float(cost.terminal(x))
+
+
+def van_der_pol(x: Tensor, u: Tensor, stiffness: float) -> Tensor:
+    y, v = x.unbind(-1)
+    return torch.stack((v, stiffness * ((1.0 - y * y) * v + u[..., 0]) - y), dim=-1)
+
+
+def lagging(x: Tensor, u: Tensor, rate: float) -> Tensor:
+    return torch.stack((x[..., 1], x[..., 2], rate * (u[..., 0] - x[..., 2])), dim=-1)
+
+
+def robertson(x: Tensor, u: Tensor) -> Tensor:
+    """Three reactions (Robertson, 1966), the second concentration times 1e4; the control heats the first."""
+    a, b, c = x.unbind(-1)
+    first, second, third = 0.04 * (1.0 + u[..., 0]) * a, b * c, 0.3 * b * b
+    return torch.stack((second - first, 1e4 * (first - second - third), third), dim=-1)
+
+
+def tank(x: Tensor, u: Tensor) -> Tensor:
+    """A stirred tank that is cooled (Hicks and Ray, 1971)."""
+    c, heat = x.unbind(-1)
+    reaction = 300.0 * torch.exp(-5.0 / heat) * c
+    cooled = 1.95e-2 * u[..., 0] * (heat - 0.38158)
+    return torch.stack(((1.0 - c) / 20.0 - reaction, (0.3947 - heat) / 20.0 + reaction - cooled), dim=-1)
+
+
+def rod(x: Tensor, force: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    px, py, vx, vy = x.unbind(-1)
+    ax, ay = -force * px - u[..., 0] * py, -force * py + u[..., 0] * px - 9.81
+    return torch.stack((vx, vy, ax, ay), -1), torch.stack((px * ax + py * ay, px * vx + py * vy), -1)
+
+
+def pendulum(x: Tensor, z: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """A mass on a rod whose force is algebraic, of index 1."""
+    rates, (along, _) = rod(x, z[..., 0], u)[0], rod(x, z[..., 0], u)[1].unbind(-1)
+    return rates, (x[..., 2:].square().sum(-1) + along).unsqueeze(-1)
+
+
+def pendulum_on_circle(x: Tensor, z: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """The same of index 2: position and velocity stay on the circle (Gear, Gupta and Leimkuhler, 1985)."""
+    rates, (_, speed) = rod(x, z[..., 0], u)[0], rod(x, z[..., 0], u)[1].unbind(-1)
+    push = torch.cat((z[..., 1:] * x[..., :2], torch.zeros_like(x[..., 2:])), -1)
+    return rates - push, torch.stack((x[..., :2].square().sum(-1) - 1.0, speed), -1)
+
+
+TO_1_2 = {"Q": [1.0, 0.0], "R": [0.1], "Qf": [10.0, 0.0], "x_ref": [1.2, 0.0]}
+TO_1 = {"Q": [0.0] * 3, "R": [0.01], "Qf": [100.0, 100.0, 0.0], "x_ref": [1.0, 0.0, 0.0]}
+UP = {"Q": [0.0] * 4, "R": [0.01], "Qf": [100.0, 100.0, 10.0, 10.0], "x_ref": [0.0, 1.0, 0.0, 0.0]}
+MADE = {"Q": [0.0] * 3, "R": [0.01], "Qf": [0.0, 0.0, 500.0], "x_ref": [0.0, 0.0, 0.3]}
+STEADY = {"Q": [10.0, 10.0], "R": [0.001], "Qf": [100.0, 100.0], "x_ref": [0.0944, 0.7766], "u_ref": [3.4]}
+SWING = {"x0": [0.0, -1.0, 0.0, 0.0], "dt": 0.05, "N": 60, "bounds": (-6.0, 6.0), "cost": UP, "guess": 0.5}
+CASES: dict[str, Case] = {
+    **{
+        f"Van der Pol, mu {stiffness:,.0f}": Case(
+            lambda x, u, s=stiffness: van_der_pol(x, u, s), [2.0, 0.0], 0.05, 40, (-2.0, 2.0), TO_1_2
+        )
+        for stiffness in (100.0, 1000.0)
+    },
+    **{
+        f"lag, {rate / 10:g} of a stage": Case(
+            lambda x, u, r=rate: lagging(x, u, r), [0.0] * 3, 0.1, 40, (-1.0, 1.0), TO_1
+        )
+        for rate in (10.0, 100.0, 1000.0)
+    },
+    "Robertson": Case(robertson, [1.0, 0.0, 0.0], 1.0, 40, (-0.9, 5.0), MADE),
+    "stirred tank": Case(tank, [0.1367, 0.7293], 0.5, 40, (0.0, 5.0), STEADY),
+    "pendulum, index 1": Case(pendulum, algebraic=1, **SWING),
+    "pendulum, index 2": Case(pendulum_on_circle, algebraic=2, **SWING),
+}
+
+
+def milliseconds(work: Callable[[], Solution]) -> tuple[float, Solution]:
+    """The least processor time of three runs, after one that compiles, and what it gives."""
+    work()
+    took = []
+    for _ in range(3):
+        began = time.process_time()
+        solution = work()
+        took.append(1e3 * (time.process_time() - began))
+    return min(took), solution
+
+
+def row(name: str, case: Case, method: str, peer: bool) -> list[str]:
+    """A case by one method."""
+    problem, many = case.problem(method), case.problem(method, STARTS)
+    guess = lambda p: torch.full((p.B, p.N, 1), case.guess, dtype=torch.float64)
+    solve = lambda: torchgco.solve(problem, guess(problem), solver="interior_point", verbose=False)
+    took, solution = milliseconds(solve)
+    every, batch = milliseconds(lambda: InteriorPoint().solve(many, guess(many)))
+    said, flown = float(solution.cost), np.nan
+    if case.algebraic < 2 and np.isfinite(said):  # of index 2 no state has rates without the step
+        flown = case.flown(problem, solution.U[0])
+    off = f"{100 * abs(said / flown - 1):.2g}" if np.isfinite(flown) else "-"
+    each = 1e3 * every / int(batch.iterations.sum())
+    cells = [name, method, solution.statuses[0].name, f"{int(solution.iterations)}", f"{said:.6g}", f"{flown:.6g}", off]
+    cells += [f"{took:.1f}", f"{each:.1f}"]
+    if not peer:
+        return [*cells, "-", "-", "-"]
+    prepared = CasADiSolver("ipopt").prepare(problem)
+    found = prepared.solve(problem, guess(problem))
+    theirs = 1e3 * prepared.function.stats()["t_proc_total"]
+    return [*cells, f"{int(found.iterations)}", f"{float(found.cost):.6g}", f"{theirs:.1f}"]
+
+
+def rows(names: list[str]) -> Iterator[list[str]]:
+    for name in names:
+        case = CASES[name]
+        for method in METHODS if case.algebraic < 2 else METHODS[2:]:
+            yield row(name, case, method, method != "rk4")
+
+
+def table(cases: list[str]) -> str:
+    """A row per case and method."""
+    return markdown(HEAD, rows(cases))
+
+
+main = Command(
+    __doc__, "stiff", table, "{cases}", "CasADi",
+    cases=(list(CASES), "which, by default all", list(CASES)),
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(main())
