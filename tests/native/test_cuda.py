@@ -17,6 +17,7 @@ import pytest
 import torch
 
 import torchgco
+from tests.dynamics.test_implicit import oscillator
 from tests.export.kinds import KINDS
 from tests.native import users
 from tests.native.shim import FLAGS, Shim
@@ -38,7 +39,9 @@ from torchgco.native.structures import Problem as Packed
 
 needs_gxx = pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
 pytestmark = [needs_gxx, pytest.mark.skipif(find_compiler() is None, reason="no C compiler")]
-FORMS: dict[str, Callable[[], Problem]] = {**users.PROBLEMS, **KINDS}
+FORMS: dict[str, Callable[[], Problem]] = {
+    **users.PROBLEMS, **KINDS, "implicit steps": lambda: oscillator(B=3).cast(torch.float64),
+}  # fmt: skip
 BITS = "X", "U", "cost", "K", "status", "iterations"
 # Of these forms each way of interleaving is tried, by one solver each; all others take turns.
 QUICK = [("smooth", "al_ilqr", 1), ("a body", "al_ilqr", 4), ("constraints", "interior_point", 32), ("a map", "gco", 4)]
