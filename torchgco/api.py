@@ -134,7 +134,7 @@ def solve(
     solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
         problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
-    with served_by(asked):
+    with served_by(asked.x0.device):
         problem, U0 = spared(problem, partial(_start, warm, solver, U0))
         multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
         watched = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)

@@ -119,6 +119,21 @@ def test_a_problem_of_a_device_is_served_there(monkeypatch) -> None:
     assert "kernel_tgco_interior" in shims.launched
 
 
+def test_commands_of_a_device_are_sampled_there(monkeypatch) -> None:
+    """From states of the device, and controls are there, too."""
+    sampler, shims = SAMPLERS["rounds of smooth noise"], Shims()
+    controller = torchgco.MPPIController(problem_of("cpu")[0], sampler)
+    states = [problem_of("cpu")[0].x0 + 0.01 * i for i in range(2)]
+    expected = [controller.command(x).tolist() for x in states]
+    served = OnDevice(shims, 1)
+    monkeypatch.setattr(elsewhere, "on_device", lambda device: served if device.type == OTHER.type else None)
+    with SecondDevice():
+        controller = torchgco.MPPIController(problem_of(OTHER)[0], sampler)
+        controls = [controller.command(x.to(OTHER)) for x in states]
+        assert [u.tolist() for u in controls] == expected and controls[0].device == OTHER
+    assert "sample_fly" in shims.launched
+
+
 def test_without_a_device_there_are_no_kernels() -> None:
     assert elsewhere.on_device(torch.device("cpu")) is None
     if not torch.cuda.is_available():

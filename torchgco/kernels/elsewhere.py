@@ -34,7 +34,7 @@ def on_cpu(problem: Problem) -> Problem | None:
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
     there = _held_on_cpu(problem)
-    with computing_on(CPU), served_by(problem):
+    with computing_on(CPU), served_by(device):
         if not serves(there):
             return None
     global _said
@@ -52,10 +52,10 @@ def on_device(device: torch.device) -> OnDevice | None:
 
 
 @contextmanager
-def served_by(problem: Problem) -> Iterator[None]:
-    """In this block what iterates on many problems runs on this one's device, if that has kernels."""
-    device = on_device(problem.x0.device) if native() else None
-    with nullcontext() if device is None else working_on(device):
+def served_by(device: torch.device) -> Iterator[None]:
+    """In this block what iterates on many problems runs on a device, if that has kernels."""
+    kernels = on_device(device) if native() else None
+    with nullcontext() if kernels is None else working_on(kernels):
         yield
 
 

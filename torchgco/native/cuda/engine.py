@@ -93,13 +93,16 @@ class Kernel:
         library = self.library
         return library.device.load(source(library.form, library.program, self.name, library.real))
 
+    def pays(self, threads: int) -> bool:
+        """Whether so many threads of the device are faster than the CPU."""
+        return not self._refused and threads >= self.library.device.least * torch.get_num_threads()
+
     def served(self, argument: Any, first: int, count: int) -> bool:
         """Call it on `count` problems; False where the CPU is to do that, as it is faster, or the device can't.
 
         A DeviceWarning says once why a device can't.
         """
-        threads = count * (argument.samples if isinstance(argument, c.Sampling) else 1)
-        if self._refused or threads < self.library.device.least * torch.get_num_threads():
+        if not self.pays(count * (argument.samples if isinstance(argument, c.Sampling) else 1)):
             return False
         try:
             self._run(argument, first, first + count)
