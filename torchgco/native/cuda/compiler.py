@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -23,7 +25,7 @@ _ERROR_LINES = 5
 def available() -> bool:
     """Whether the extra `cuda` is installed, and PyTorch sees a device."""
     try:
-        return find_spec("cuda.core") is not None and torch.cuda.is_available()
+        return torch.version.cuda is not None and find_spec("cuda.core") is not None and torch.cuda.is_available()
     except ModuleNotFoundError:  # there is no package `cuda` at all
         return False
 
@@ -56,13 +58,21 @@ def _version() -> str:
 
 def _compiled(text: str, arch: str) -> bytes:
     core = import_module("cuda.core")
-    try:
+    with _refusals():
         return bytes(core.Program(text, "c++", core.ProgramOptions(arch=arch, **OPTIONS)).compile("cubin").code)
-    except Exception as error:  # NVRTCError, which cuda-core exports nowhere
-        if type(error).__name__ != "NVRTCError":
+
+
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """What NVRTC or the driver refuses is a NativeError."""
+    try:
+        yield
+    except Exception as error:
+        kind = type(error).__name__
+        if kind not in ("NVRTCError", "CUDAError"):  # which cuda-core exports nowhere
             raise
-        said = [line for line in str(error).splitlines() if "error" in line]
-        raise NativeError("\n".join(["NVRTC failed:", *said[:_ERROR_LINES]])) from error
+        said = [line for line in str(error).splitlines() if "error" in line] or str(error).splitlines()
+        raise NativeError("\n".join([f"{kind}: {said[0]}", *said[1:_ERROR_LINES]])) from error
 
 
 class Loaded:
@@ -78,7 +88,7 @@ class Loaded:
         self.device = torch.device("cuda", index)
         torch.zeros(1, device=self.device)  # PyTorch's context, which its tensors are in
         self._device = self._core.Device(index)
-        with torch.cuda.device(self.device):
+        with torch.cuda.device(self.device), _refusals():
             self._device.set_current()
             self.multiprocessors = int(self._device.properties.multiprocessor_count)
             self._code = self._core.ObjectCode.from_cubin(cubin(text, f"sm_{self._device.arch}"))
@@ -89,7 +99,7 @@ class Loaded:
 
     def launch(self, kernel: str, blocks: int, *arguments: int) -> None:
         config = self._core.LaunchConfig(grid=blocks, block=THREADS)
-        with torch.cuda.device(self.device):
+        with torch.cuda.device(self.device), _refusals():
             self._device.set_current()
             stream = torch.cuda.current_stream(self.device)
             self._core.launch(stream, config, self._code.get_kernel(kernel), *arguments)
