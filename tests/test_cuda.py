@@ -1,5 +1,5 @@
-"""On a CUDA device PyTorch's kernels give the answers of the CPU's, within rounding, and those in CUDA C++ the bits of C;
-skipped without a device.
+"""On a CUDA device PyTorch's kernels give the answers of the CPU's, within rounding, and those in CUDA C++ the bits of
+C; skipped without a device.
 
 `tests/test_other_device.py` finds mixed devices without hardware. These are the operations themselves.
 """

@@ -8,13 +8,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchgco.native.cuda.source import SAMPLES, THREADS
+from torchgco.native.cuda.source import ROWS, SAMPLES, THREADS
 from torchgco.native.declarations import Structure, kept_by
 from torchgco.native.structures import Problem, Sampling
 
 # Blocks of a multiprocessor at the same time, where each thread has the 255 registers that it may have at most: 65,536.
 BLOCKS = 65536 // (256 * THREADS)
-ROWS = 8 * 13  # bytes of the structure Rows, and of two pointers, for each constraint: see memory.h, interior_memory.h
 SHARE = 0.5  # of a device's free memory that a call may take: what it reads lies there, too
 _WORD = 8
 SUMS = {8: 8, 4: 16}  # partial sums over samples, by the bytes of a number: see mppi.c
@@ -182,5 +181,5 @@ def sample(module: Module, how: Sampling, problem: Problem, numbers: int, size: 
 
 
 def _others(problem: Problem) -> int:
-    """Bytes that a problem needs beside numbers."""
-    return ROWS * (problem.constraints + 1) + 64
+    """Bytes that a problem needs beside numbers; two lists of its own number are among them."""
+    return ROWS * (problem.constraints + 1) + 2 * _WORD

@@ -15,6 +15,7 @@ HERE = Path(__file__).parent / "c"
 WARP = 32
 THREADS = 128  # of a block
 SAMPLES = 1024  # bytes of the structure Samples, at most
+ROWS = 104  # bytes of the structure Rows and of two pointers, at most: of each constraint, beside numbers
 OF_ONE = {name: C / "scalar" / name for name in ("vectors.h", "wide.h", "words.h")}
 ON_DEVICE = "standard.h", "allocation.h", "clock.h", "asking.h", "noise.h", "strided.h", "kernels.h", "sampling.h"
 
@@ -60,7 +61,7 @@ def source(form: Form, program: Program, name: str, real: str = "double") -> str
     given = {name: path.read_text() for name, path in OF_ONE.items()}
     given |= {name: (HERE / name).read_text() for name in ON_DEVICE}
     given["pointers.h"] = given.pop("strided.h") if program.stride > 1 else (C / "pointers.h").read_text()
-    sizes: dict[str, Any] = {"STRIDE": program.stride, "THREADS": THREADS, "SAMPLES": SAMPLES}
+    sizes: dict[str, Any] = {"STRIDE": program.stride, "THREADS": THREADS, "SAMPLES": SAMPLES, "ROWS": ROWS}
     text = form.alone(program.files, given, REAL=real, **sizes) + HEADER.layout
     if "kernels.h" in program.files:
         text += f"KERNEL({program.functions[name]}, {name})\n"

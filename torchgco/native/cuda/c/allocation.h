@@ -2,6 +2,7 @@
    all else, from which it takes as from a stack. All of it is free again when a problem is begun. */
 #pragma once
 #include "model.h"
+_Static_assert(sizeof(Rows) + 2 * sizeof(void *) <= ROWS, "Rows have more bytes than Python takes for them");
 
 /* Of all threads: numbers of each, and bytes of all else. */
 typedef struct { V *numbers; char *others; int64_t count, bytes; } Arenas;
