@@ -308,7 +308,7 @@ TGCO_LARGE void relax(Barrier *t, Track *k, I running) {
     I lacks = running & (largest > SET(t->how->explodes) * t->raised) & NOT(k->relaxed) & NOT(k->watching);
     if (!any(lacks)) return;
     k->relaxed |= lacks;
-    visit_rows(t, lacks, 1, loosen);
+    visit_rows(t, lacks, 1, CALLED(loosen));
     settle(t, k, lacks, 0);
     renew(t, lacks);
 }
@@ -321,7 +321,7 @@ TGCO_LARGE I readmit(Barrier *t, Track *k, I of, double admitted) {
     EACH_ROW(t, 0, q) broken |= of & is_broken(t, q);
     if (!any(broken)) return changed;
     EACH_ROW(t, 0, q) t->dz[q] = tgco_truth(t->out[q]); /* no step is under way */
-    visit_rows(t, broken, 0, come_in);
+    visit_rows(t, broken, 0, CALLED(come_in));
     EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
     if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (LANE(changed, l)) {

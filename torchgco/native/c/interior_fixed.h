@@ -121,7 +121,7 @@ static void find_nearby(Barrier *t) {
 
 /* Visits the tight rows of all knots, or `all`. Which of them a change of all free variables moves, `moves`, is seen in two
    trajectories close together: a row may be flat in one point alone. */
-TGCO_LARGE void visit_rows(Barrier *t, I of, int all, Visit *visit) {
+TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
     const Lanes *s = &t->lanes;
     const Problem *p = s->of;
     int some = 0;
@@ -210,7 +210,7 @@ TGCO_LARGE void sort_rows(Barrier *t, I of) {
     for (int64_t k = 0; k <= p->N; k++)
         for (int64_t i = 0; i < p->constraints; i++)
             if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) measure_room(t, of, i, k);
-    visit_rows(t, of, 0, leave_out);
+    visit_rows(t, of, 0, CALLED(leave_out));
     I some = of & NOT(of);
     for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
     t->some_out = any(some);

@@ -156,7 +156,7 @@ TGCO_LARGE void leave(const Lanes *s, int lane, int32_t status, int32_t converge
 typedef void Enter(Lanes *s, int lane, int64_t e);
 typedef void Put(Lanes *s, int64_t e, int used);
 
-static int put_all(const Problem *p, int64_t first, int64_t last, Enter *load, Put *put) {
+static int put_all(const Problem *p, int64_t first, int64_t last, CALLABLE(Enter) load, CALLABLE(Put) put) {
     Lanes lanes, *s = &lanes;
     if (!start(s, p)) return 0;
     for (int64_t e = first; e < last; e += LANES) {

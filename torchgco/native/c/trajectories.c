@@ -11,7 +11,9 @@ static void put_values(Lanes *s, int64_t e, int used) {
         s->of->merit[e + l] = LANE(merit, l);
     }
 }
-int tgco_value(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_values); }
+int tgco_value(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_values));
+}
 
 /* Rollout of U from the first knot of X. */
 int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 0); }
@@ -40,7 +42,9 @@ static void put_expansion(Lanes *s, int64_t e, int used) {
         }
     }
 }
-int tgco_expand(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_expansion); }
+int tgco_expand(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_expansion));
+}
 
 /* How many numbers of a lane these functions and tgco_outer have room for. */
 int64_t tgco_solver_room(const Problem *p) {

@@ -10,7 +10,7 @@ static void put_violation(Lanes *s, int64_t e, int used) {
     for (int l = 0; l < used; l++) s->of->merit[e + l] = LANE(violation, l);
 }
 int tgco_violation(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_iterate, put_violation);
+    return put_all(p, first, last, CALLED(enter_iterate), CALLED(put_violation));
 }
 
 /* The same of rows of obstacles alone. */
@@ -20,7 +20,7 @@ static void put_penetration(Lanes *s, int64_t e, int used) {
     for (int l = 0; l < used; l++) s->of->merit[e + l] = LANE(violation, l);
 }
 int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_iterate, put_penetration);
+    return put_all(p, first, last, CALLED(enter_iterate), CALLED(put_penetration));
 }
 
 /* Whether slightly other controls lead to other states than rounding would. */
@@ -62,7 +62,9 @@ static void put_gains(Lanes *s, int64_t e, int used) {
         for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = LANE(s->G[i], l);
     }
 }
-int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
+int tgco_gains(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_gains));
+}
 
 /* Costates along given trajectories, (E, N+1, NX), by which J_var + lam'c is stationary in the states; into `slopes`. */
 static void put_costates(Lanes *s, int64_t e, int used) {
@@ -83,7 +85,9 @@ static void put_costates(Lanes *s, int64_t e, int used) {
             for (int i = 0; i < NX; i++) p->slopes[((e + l) * (N + 1) + k) * NX + i] = LANE(y[i], l);
     }
 }
-int tgco_costates(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_costates); }
+int tgco_costates(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_costates));
+}
 
 /* What the states and controls of a solve stand for: the rollout U + K (x - X) from the first knot of X, in place, by
    finite gains (E, N, NU, NZ), of which K is used; or that of U alone, where it is X up to rounding and the first isn't.
@@ -144,7 +148,7 @@ static void put_followed(Lanes *s, int64_t e, int used) {
     }
 }
 int tgco_follow(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_followed, put_followed);
+    return put_all(p, first, last, CALLED(enter_followed), CALLED(put_followed));
 }
 
 #if DIM > 0
