@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import torch
@@ -84,6 +85,7 @@ def compile_all(bench: Bench, arch: str) -> None:
     forms = {name: Engine(problem_of(name, 1), compiles=False).form for name in bench.forms}
     texts = [source(form, *SOLVERS[solver]) for form in forms.values() for solver in SOLVERS]
     texts += [source(form, SAMPLER, "tgco_sample", real) for form in _sampled(forms) for real in ("double", "float")]
+    import_module("cuda.core")  # by this thread: others would see a part of it
     with ThreadPoolExecutor() as workers:
         list(workers.map(partial(_tried, arch), texts))
 
