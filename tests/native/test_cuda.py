@@ -134,6 +134,25 @@ def test_commands_of_a_device_are_sampled_there(monkeypatch) -> None:
     assert "sample_fly" in shims.launched
 
 
+def test_compiled_problems_of_a_device_are_solved_there(monkeypatch) -> None:
+    """By calls and by a control loop; their answers lie on the CPU."""
+    found, shims = [], Shims()
+    served = OnDevice(shims, 1)
+    monkeypatch.setattr(elsewhere, "on_device", lambda device: served if device.type == OTHER.type else None)
+    for device in ("cpu", OTHER):
+        with SecondDevice():
+            problem, _ = problem_of(device)
+            call, loop = (
+                torchgco.compile(problem, "interior_point", receding=True),
+                torchgco.MPC(problem, "interior_point"),
+            )
+            x = problem_of("cpu")[0].x0
+            answers = [call(x0=x + 0.01 * i) for i in range(2)]
+            found.append([answer.U.tolist() for answer in answers] + [loop.step(x).tolist(), loop.step(x).tolist()])
+            assert not shims.made or device == OTHER
+    assert found[0] == found[1] and "kernel_tgco_interior" in shims.launched
+
+
 def test_without_a_device_there_are_no_kernels() -> None:
     assert elsewhere.on_device(torch.device("cpu")) is None
     if not torch.cuda.is_available():

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.errors import InputError
 from torchgco.base.numbers import as_floats, measured
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
@@ -17,7 +16,7 @@ from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, wit
 from torchgco.compiled.numbers import Numbers
 from torchgco.compiled.stages import stage_of
 from torchgco.guidance.mppi import MPPI
-from torchgco.kernels import current, on_cpu, open_loop, served_by
+from torchgco.kernels import current, held_on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.alone import check_rows
 from torchgco.problem.problem import Problem, current_problem
@@ -54,12 +53,7 @@ class MPPIController:
     ) -> None:
         check_untransformed("MPPIController")
         problem = current_problem(problem)
-        self._device = problem.x0.device
-        if self._device.type != "cpu":
-            there = on_cpu(problem)
-            if there is None:
-                raise InputError("problem", "one on the CPU", str(self._device))
-            problem = there
+        self._device, problem = problem.x0.device, held_on_cpu(problem)
         self.sampler = check_value(sampler or MPPI(), MPPI, "sampler")
         self.sampler.check(problem)
         self.seed, self.period = check_value(seed, Seed, "seed"), check_value(period, Seconds | None, "period")

@@ -14,6 +14,7 @@ from torchgco.kernels.choice import native as native
 from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
 from torchgco.kernels.elsewhere import copied_to as copied_to
+from torchgco.kernels.elsewhere import held_on_cpu as held_on_cpu
 from torchgco.kernels.elsewhere import on_cpu as on_cpu
 from torchgco.kernels.elsewhere import served_by as served_by
 from torchgco.kernels.verbs import chord_clearance as chord_clearance

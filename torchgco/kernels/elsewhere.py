@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import DeviceWarning
+from torchgco.base.errors import DeviceWarning, InputError
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import field_names, mapped
 from torchgco.kernels.choice import native, serves
@@ -33,7 +33,7 @@ def on_cpu(problem: Problem) -> Problem | None:
     device = problem.x0.device
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
-    there = _held_on_cpu(problem)
+    there = _copied(problem)
     with computing_on(CPU), served_by(device):
         if not serves(there):
             return None
@@ -42,6 +42,18 @@ def on_cpu(problem: Problem) -> Problem | None:
         _said = True
         told = f"problems on {device} are solved by C on the CPU, with copies: PyTorch's kernels take far longer there"
         warnings.warn(told, DeviceWarning, stacklevel=4)
+    return there
+
+
+def held_on_cpu(problem: Problem) -> Problem:
+    """The problem on the CPU: itself, or as `on_cpu` has it.
+
+    Raises:
+        InputError: C doesn't serve it there.
+    """
+    there = problem if problem.x0.device.type == CPU.type else on_cpu(problem)
+    if there is None:
+        raise InputError("problem", "one on the CPU", str(problem.x0.device))
     return there
 
 
@@ -59,7 +71,7 @@ def served_by(device: torch.device) -> Iterator[None]:
         yield
 
 
-def _held_on_cpu(problem: Problem) -> Problem:
+def _copied(problem: Problem) -> Problem:
     """The problem without gradients; what users' functions hold stays where it is."""
     change = lambda leaf: leaf.detach().to(CPU, torch.float64 if leaf.is_floating_point() else leaf.dtype)
     parts = {name: mapped(getattr(problem, name), change) for name in field_names(type(problem))}
