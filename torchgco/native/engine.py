@@ -25,7 +25,7 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit, build
-from torchgco.native.cuda.engine import Kernel, Library, current
+from torchgco.native.cuda.engine import Kernel, Library, current_device
 from torchgco.native.cuda.source import SOLVER
 from torchgco.native.packing import (
     constraint_of,
@@ -99,7 +99,7 @@ class Engine:
         Args:
             of_device: a `Program`, and the type of its numbers, for a library of a device.
         """
-        device = current()
+        device = current_device()
         key = device, name
         if key not in self._libraries:
             with setting_up():

@@ -106,28 +106,29 @@ static void fly(Samples *q) {
     }
 }
 
+/* Keep the `most` smallest gaps so far, in order, of which there are `held`. */
+static int64_t keep_smallest(double *best, int64_t held, int64_t most, double gap) {
+    if (held == most && !(gap < best[held - 1])) return held;
+    int64_t at = held < most ? held++ : held - 1;
+    for (; at > 0 && best[at - 1] > gap; at--) best[at] = best[at - 1];
+    best[at] = gap;
+    return held;
+}
+
 /* Scores to weights w = softmax(-(S - min S) / lambda), in place. */
 static void weigh(const Sampling *o, double *score) {
-    int64_t count = o->samples;
-    double least = DBL_MAX, temperature = o->temperature, sum = 0, *best = score + count; /* the smallest gaps, in order */
+    int64_t count = o->samples, held = 0;
+    double least = DBL_MAX, temperature = o->temperature, sum = 0, *best = score + count;
     SHARED(i, count) if (score[i] < least) least = score[i];
     least = LEAST_OF_ALL(least);
     SHARED(i, count) score[i] -= least;
     ALL_DONE;
-    if (o->elite > 0 && IS_FIRST) {
-        int64_t held = 0;
-        for (int64_t i = 0; i < count; i++) {
-            if (held == o->elite && !(score[i] < best[held - 1])) continue;
-            int64_t at = held < o->elite ? held++ : held - 1;
-            for (; at > 0 && best[at - 1] > score[i]; at--) best[at] = best[at - 1];
-            best[at] = score[i];
-        }
-    }
+    if (o->elite > 0) IN_ORDER(i, score, count) if (IS_FIRST) held = keep_smallest(best, held, o->elite, STAGED(score, i));
     ALL_DONE;
     if (o->elite > 0 && best[o->elite - 1] > temperature) temperature = best[o->elite - 1];
     SHARED(i, count) score[i] = exp(-score[i] / temperature);
     ALL_DONE;
-    for (int64_t i = 0; i < count; i++) sum += score[i];
+    IN_ORDER(i, score, count) sum += STAGED(score, i);
     ALL_DONE;
     SHARED(i, count) score[i] /= sum;
 }

@@ -42,10 +42,12 @@ static void memmove_down(void *to, const void *from, size_t bytes) {
 #define __shared__ static
 static int64_t tgco_thread;
 #define THREAD tgco_thread
+#define BLOCK_NUMBER tgco_thread
+#ifndef LOCAL_THREAD /* as tests define it */
 #define LOCAL_THREAD 0
 #define LOCAL_THREADS 1
-#define BLOCK_NUMBER tgco_thread
 #define __syncthreads() ((void)0)
+#endif
 static inline unsigned long long atomicAdd(unsigned long long *at, unsigned long long more) {
     unsigned long long before = *at;
     *at += more;
