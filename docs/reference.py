@@ -1,4 +1,4 @@
-"""The API reference from the docstrings: `make docs`, into docs/api.
+"""The API reference from the docstrings: `make docs`, into docs/api; and docs/options.md, the options of solvers.
 
 The first page has what `torchgco` itself names; others have the packages that users import from besides. All else is
 inside, and documented in the source.
@@ -13,10 +13,12 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import get_type_hints
 
+import options
 import pdoc
 
 import torchgco
 
+FOLDER = Path(__file__).parent / "api"
 PAGES = (
     "torchgco", "torchgco.scenarios", "torchgco.missions", "torchgco.plotting", "torchgco.baselines",
     "torchgco.constraints", "torchgco.obstacles", "torchgco.solvers.contracts", "torchgco.lagrangian.penalties",
@@ -26,15 +28,18 @@ PAGES = (
 
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "api")
+    parser.add_argument("--output", type=Path, default=FOLDER, help="elsewhere the reference alone is made")
     output = parser.parse_args(words).output
-    vars(torchgco)["compose"] = torchgco.compose  # imported lazily: pdoc looks for it in the module
+    for name in ("compose", "read"):  # imported lazily: pdoc looks for them in the module
+        vars(torchgco)[name] = getattr(torchgco, name)
     for page in pdoc.extract.walk_specs(PAGES):
         pdoc.extract.load_module(page)
     for kind in _classes():
         _resolve(kind)
     pdoc.render.configure(docformat="google")
     pdoc.pdoc(*PAGES, output_directory=output)
+    if output == FOLDER:
+        options.PAGE.write_text(options.text())
     return 0
 
 

@@ -29,9 +29,10 @@ from benchmarks.families import oracle, quality
 from benchmarks.lib.command import Command
 from benchmarks.speed import __main__ as speed
 from tests.slow import mostly
-from torchgco import Problem
+from torchgco import Problem, presets
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
+from torchgco.experiments.referee import judge
 from torchgco.experiments.reports import export, identify, report, view
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.kernels import EagerWarning
@@ -91,20 +92,22 @@ def name_of(page: Path) -> str:
 
 
 REPORTS: dict[str, Callable[[list[str]], Any]] = {
-    f"torchgco-{module.__name__.rpartition('.')[2]}": module.main for module in (report, view, export, identify)
+    f"torchgco-{module.__name__.rpartition('.')[2]}": module.main for module in (report, view, export, identify, judge)
 }
 
 
 def accept(command: str) -> None:
     """Raise, or exit, unless the program accepts the command's arguments; runs nothing."""
     program, *words = shlex.split(command, comments=True)
-    if program == "torchgco":
+    if program == "torchgco" and words[:1] == ["new"]:
+        assert len(words) == 2
+    elif program == "torchgco":
         accept_overrides([word for word in words if word not in ("--help", "--version")])
     elif program in REPORTS:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(RunParser, "run", lambda parser, arguments, work: parser.parse_args(arguments))
             options = REPORTS[program](words)
-        assert program != "torchgco-report" or options.folders
+        assert program != "torchgco-report" or options.folders or options.power
         accept_overrides(getattr(options, "words", []))
     elif program == "make":
         accept_make(words)
@@ -283,13 +286,31 @@ def test_every_extension_is_shown() -> None:
     assert shown == dict.fromkeys(kinds, 1) | {"Where is what": 0}
 
 
+def program(name: str) -> Any:
+    """A program of the manual, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_options_is_that_of_the_presets_and_their_docstrings() -> None:
+    options = program("options")
+    assert options.PAGE.read_text() == options.text(), "`make docs` writes it again"
+    lines = options.text().splitlines()
+    for name in presets.PRESETS:
+        assert f"### {name}" in lines
+    meanings = [line for line in lines[lines.index("## Meanings") :] if line.startswith("| `")]
+    assert len(meanings) > 90 and not [line for line in meanings if "` |  |" in line or "as of `" in line]
+    for option in ("| `passes.paths.num_paths` | `6` | `6` |", "| `passes.samples.redraws` | `2` | `3` |"):
+        assert any(line.startswith(option) for line in lines), option
+    assert any("`max_gap`" in line and "or null" in line and "twice as many paths" in line for line in meanings)
+
+
 @pytest.mark.skipif(find_compiler() is None, reason="the figures watch native kernels")
 def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "algorithm.md"
-    spec = importlib.util.spec_from_file_location("figures", page.parent / "figures.py")
-    assert spec is not None and spec.loader is not None
-    figures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(figures)
+    page, figures = ROOT / "docs" / "algorithm.md", program("figures")
     before = page.read_text()
     assert figures.main(["--output", str(tmp_path)]) == 0
     assert page.read_text() == before, "`make figures` brings the page up to date"
@@ -314,7 +335,7 @@ def test_every_public_name_exists() -> None:
     assert len(set(torchgco.__all__)) == len(torchgco.__all__)
     held = vars(torchgco).items()
     public = {name for name, value in held if getattr(value, "__module__", "").startswith("torchgco.")}
-    assert public | {"compose", "presets"} == set(torchgco.__all__)
+    assert public | {"compose", "presets", "read"} == set(torchgco.__all__)
     for name in torchgco.__all__:
         assert getattr(torchgco, name) is not None
 

@@ -9,7 +9,8 @@ where it can't serve. `solvers` holds the local solvers: AL-iLQR (with the `lagr
 obstacles catch a trajectory, `search` runs the table of passes that `presets.gco` lists, along paths from the
 `roadmap` and from samples of the `guidance`, and keeps the best. `judging` measures the result by code of its own.
 
-`torchgco.compose` needs Hydra and is imported lazily: importing torchgco loads neither Hydra nor matplotlib.
+`torchgco.compose` needs Hydra, `torchgco.read` pandas, and both are imported lazily: importing torchgco loads neither
+Hydra nor matplotlib.
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ from torchgco.solvers import ILQR, AugmentedLagrangian, InteriorPoint, LineSearc
 if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage as HtmlPage
     from torchgco.experiments.config.build import compose as compose
+    from torchgco.experiments.results.merge import read as read
 
 # In the order of the API reference.
 __all__ = [  # noqa: RUF022
@@ -100,8 +102,8 @@ __all__ = [  # noqa: RUF022
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result
     "judge", "certify", "Certificate",
-    # layouts, configurations, errors
-    "Layouts", "compose", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
+    # layouts, configurations, studies, errors
+    "Layouts", "compose", "read", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
     "RefusalWarning", "ScaleWarning", "StartWarning", "StepWarning", "TraceWarning",
     "DeviceWarning",
 ]  # fmt: skip
@@ -131,4 +133,8 @@ def __getattr__(name: str) -> Any:
         from torchgco.experiments.config.build import compose
 
         return compose
+    if name == "read":
+        from torchgco.experiments.results.merge import read
+
+        return read
     raise AttributeError(f"module 'torchgco' has no attribute {name!r}")

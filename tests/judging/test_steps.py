@@ -108,6 +108,31 @@ def test_no_wrong_cost_is_missed_and_no_right_one_flagged(integrator: str, linea
     assert bool((errors.step_cost[slow] / wrong[slow] - 0.85).abs().lt(0.25).float().mean() > 0.8)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_cost_tells_of_steps_that_no_state_tells_of(seed: int) -> None:
+    """Swings that a midpoint step follows loosely: every difference is a small share of its range, all together not."""
+    B, draws = 256, torch.Generator().manual_seed(seed)
+    rate, loss = 0.5 + 12.0 * torch.rand(B, generator=draws, dtype=D), torch.rand(B, generator=draws, dtype=D)
+    A, b = torch.zeros(B, 3, 3, dtype=D), torch.zeros(B, 3, 1, dtype=D)
+    A[:, 0, 1], A[:, 2, 0], A[:, 2, 2], b[:, 1, 0] = 1.0, 1.0, -0.5, rate
+    A[:, 1, 0], A[:, 1, 1] = -(rate**2), -(0.1 + 1.9 * loss) * rate
+    field = lambda x, u, A, b: (A @ x.unsqueeze(-1) + b @ u.unsqueeze(-1))[..., 0]
+    model = FunctionDynamics(field, 3, 1, DT, "midpoint", values={"A": A, "b": b})
+    cost = QuadraticCost([1.0, 0.01, 0.01], [0.01], [10.0, 0.0, 0.0], x_ref=[1.0, 0.0, 0.0])
+    problem = Problem(model, cost, [ControlBounds(-3.0, 3.0)], torch.zeros(B, 3, dtype=D), 20)
+    found = solved(problem)
+    errors = step_errors(problem, found.X, found.U, None, found.multipliers.lam)
+    E = torch.linalg.matrix_exp(DT * torch.cat((torch.cat((A, b), -1), torch.zeros(B, 1, 4, dtype=D)), 1))
+    path = found.X.clone()
+    for k in range(problem.N):
+        path[:, k + 1] = (E[:, :3, :3] @ path[:, k].unsqueeze(-1) + E[:, :3, 3:] @ found.U[:, k].unsqueeze(-1))[..., 0]
+    wrong = (problem.cost.total(path, found.U) - found.cost).abs() / found.cost.abs()
+    missed = ~errors.large & (wrong > 0.01)
+    assert int((wrong > 0.01).sum()) >= 64 and int(missed.sum()) <= 0.1 * int((wrong > 0.01).sum())
+    assert not bool(missed[wrong > 0.02].any())  # to first order errors are what they are said to be
+    assert not bool(errors.large[(wrong < 0.007) & (errors.step_error < 0.1)].any())
+
+
 def test_euler_steps_are_measured_by_their_own_order() -> None:
     """Costs that are off by a share of 1 / N or so are usual for Euler steps; beyond rate dt = 2 these explode."""
     problem = drawn("euler")

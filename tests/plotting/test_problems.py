@@ -157,7 +157,7 @@ def test_obstacles_of_a_users_kind_are_drawn_by_their_distance() -> None:
     base, _ = planar_batch(B=1, N=10, obstacles=1)
     problem = Problem(base.dynamics, base.cost, [Shore(torch.tensor([0.1], dtype=torch.float64))], base.x0, 10)
     (part,) = world_of(problem, 0).others
-    _, y, apart = distances(part, np.array([-1.0, 0.0]), np.array([1.0, 1.0]), (0, 1), 0.0)
+    _, y, apart = distances(part, np.array([[-1.0, 0.0], [1.0, 1.0]]), (0, 1), 0.0)
     np.testing.assert_allclose(apart, 0.4 - y, atol=1e-12)
     scene = axes_of(torchgco.plot(problem, flown(problem)))[0]
     assert any(len(filled.get_paths()) for filled in scene.collections)

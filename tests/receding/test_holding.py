@@ -27,6 +27,7 @@ from torchgco import (
     Unicycle,
 )
 from torchgco.native.compiler import find_compiler
+from torchgco.problem.horizons import for_solvers
 from torchgco.receding.stopping import stopping
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -240,6 +241,27 @@ def test_what_comes_to_rest_is_no_faster_than_states_may_be_and_turns_as_before(
     assert float(X[..., 3].min()) >= -0.3 - 1e-9 and float(X[..., 3].max()) <= 1.0 + 1e-9
     turned, back = X[0, :, -1, 2].abs() > 0.5, X[0, :, -1, :2].norm(dim=-1) > 0.15  # at 0.3 m/s, for 0.7 s
     assert bool((turned & back).any()) and bool((X[1, :, -1, 0] > 0.9).any())
+
+
+@pytest.mark.parametrize("form", ["rates", "rates from others", "two bounds", "free time"])
+def test_bounds_of_states_hold_in_the_form_that_solvers_work_on(form: str) -> None:
+    """Whose states are followed by further ones: the controls before, or the length of a stage."""
+    draw, place, stated = torch.Generator().manual_seed(0), drives(64), form.startswith("rates")
+    x0 = torch.rand(64, 4, generator=draw, dtype=torch.float64) * torch.tensor([1.0, 1.0, 6.0, 1.25]).double()
+    x0[:, 3] -= 0.25
+    parts = [*place.constraints, StateBounds([-9e9] * 4, [9e9] * 3 + [0.9])]
+    parts += [RateBounds(-0.5, 0.5, previous=[0.0, 0.0] if "others" in form else None)] if stated else []
+    time = FreeTime(0.5, 2.0) if form == "free time" else None
+    problem = Problem(place.dynamics, place.cost, parts, x0, N, goal=Goal([3.0, 1.0], 0.2), time=time)
+    U = stopping(for_solvers(problem), None)
+    assert U is not None and bool((U[..., :2].abs() <= torch.tensor([1.0, 1.5]) + 1e-9).all())
+    if time is None:
+        torch.testing.assert_close(U, stopping(problem, None), rtol=0.0, atol=1e-6)
+    if not stated:  # else a speed is left only as fast as rates let it
+        x = x0.unsqueeze(1).expand(-1, U.shape[1], -1)
+        for k in range(N):
+            x = place.dynamics.step(x, U[:, :, k, :2])
+            assert bool((x[..., 3] <= x0[:, 3:].clamp(min=0.9) + 1e-9).all())
 
 
 def test_a_robot_speeds_up_in_a_bend_where_only_that_serves() -> None:

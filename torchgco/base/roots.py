@@ -8,12 +8,15 @@ from contextvars import ContextVar
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor  # type: ignore[import]
 
 from torchgco.base.autodiff import jacobian
+from torchgco.base.gradients import asks
 
-# Newton's method ends where its correction is this share of the unknowns: the error that is left is of its square.
-NEARLY_CONVERGED = 2.0 / 3.0  # as a power of the precision
 MOST_EVALUATIONS = 30  # 15 corrections from any guess that serves, and as many halvings
+# Of steps of this share of the unknowns, a power of the precision, rounding decides whether they serve: they end.
+BY_ROUNDING = 2.0 / 3.0
+SERVES_AGAIN = 0.1  # slopes serve for another correction where it is this share of the last one
 
 _LIBRARY = torch.library.Library("torchgco", "DEF")
 _LIBRARY.define("unknown(Tensor guess) -> Tensor")
@@ -40,9 +43,9 @@ def roots_as_operations() -> Iterator[None]:
 def root(residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
     """z (..., q) where residual(z) (..., q), which maps each row by itself, is 0; NaN in rows where none is found.
 
-    By Newton's method with corrections that are halved until the residual is less (Nocedal and Wright, Numerical
-    Optimization, section 11.2). Its first and second derivatives by all that the residual reads are those of the
-    implicit function. Roots that the residual itself asks for, of as many rows, are found together with it.
+    By Newton's method, with halved corrections where it must be. Its first and second derivatives by all that the
+    residual reads are those of the implicit function. Roots that the residual itself asks for, of as many rows, are
+    found together with it.
     """
     if _AS_OPERATIONS.get():
         unknown = torch.ops.torchgco.unknown(guess)
@@ -51,11 +54,16 @@ def root(residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
         return around.root_within(residual, guess)
     equation = _Equation(residual, guess)
     z = _newton(equation, equation.guess)
-    inverse = torch.linalg.inv_ex(_slopes(equation, z))[0]
-    # A step of Newton's method with a constant inverse brings one more derivative each.
-    for _ in range(2):
-        z = z - (inverse @ equation(z).unsqueeze(-1)).squeeze(-1)
+    if _is_differentiated(equation(z)):
+        inverse = torch.linalg.inv_ex(_slopes(equation, z))[0]
+        # A step of Newton's method with a constant inverse brings one more derivative each.
+        for _ in range(2):
+            z = z - _times(inverse, equation(z))
     return z[..., : guess.shape[-1]]
+
+
+def _is_differentiated(value: Tensor) -> bool:
+    return is_functorch_wrapped_tensor(value) or asks(value)
 
 
 class _Equation:
@@ -94,29 +102,41 @@ _AROUND: ContextVar[_Equation | None] = ContextVar("around", default=None)
 
 
 def _newton(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
-    """The root without derivatives."""
-    epsilon = torch.finfo(z.dtype).eps
-    size = torch.full_like(z[..., 0], torch.inf)
-    correction, share, done = torch.zeros_like(z), torch.ones_like(size), torch.zeros_like(size, dtype=torch.bool)
+    """The root without derivatives.
+
+    A step serves where the correction that the same slopes ask for after it is less than the step itself: the natural
+    monotonicity test, which no scale of the residual changes (Deuflhard, Newton Methods for Nonlinear Problems, section
+    3.3). Slopes serve again where it is a tenth at most; the root is found where what is left is less than rounding.
+    """
+    rest, epsilon = residual(z).detach(), torch.finfo(z.dtype).eps
+    lost = ~torch.isfinite(rest).all(-1)
+    done, share = lost, torch.ones_like(rest[..., 0])
+    inverse = torch.linalg.inv_ex(_slopes(residual, z))[0]
+    step = -_times(inverse, rest)
     for _ in range(MOST_EVALUATIONS):
-        trial = z + share.unsqueeze(-1) * correction
+        trial = z + share.unsqueeze(-1) * step
         rest = residual(trial).detach()
-        new_size, of_trial = rest.square().sum(-1), trial.abs().amax(-1)
-        better = (new_size < size) & ~done
-        # The next correction is less than rounding, if it is to this residual as the last one was to the one before.
-        next_size = new_size * correction.abs().amax(-1).square()
-        exact = better & (size < torch.inf) & (next_size <= (epsilon * of_trial).square() * size)
-        ahead = -torch.linalg.solve_ex(_slopes(residual, trial), rest)[0]
-        accepted = better.unsqueeze(-1)
-        z, correction = torch.where(accepted, trial, z), torch.where(accepted, ahead, correction)
-        size, share = torch.where(better, new_size, size), torch.where(better, 1.0, 0.5 * share)
-        near = correction.abs().amax(-1) <= epsilon**NEARLY_CONVERGED * of_trial
-        ends = better & ~exact & near
-        z = torch.where(ends.unsqueeze(-1), z + correction, z)
-        done = done | exact | ends
+        further, length = -_times(inverse, rest), step.abs().amax(-1)
+        left, of_trial = further.abs().amax(-1), trial.abs().amax(-1)
+        better = (left <= length) & ~done
+        ends = better & (left * left <= epsilon * of_trial * length)
+        ends |= ~better & ~done & (length <= epsilon**BY_ROUNDING * of_trial)
+        ahead = trial + torch.where(ends.unsqueeze(-1), further, 0.0)
+        z = torch.where(better.unsqueeze(-1), ahead, z)
+        share, done = torch.where(better, 1.0, 0.5 * share), done | ends
         if _all(done):
             break
-    return torch.where(done.unsqueeze(-1), z, torch.nan)
+        stale = better & ~ends & (left > SERVES_AGAIN * length)
+        if not _all(~stale):
+            fresh = torch.linalg.inv_ex(_slopes(residual, z))[0]
+            inverse = torch.where(stale[..., None, None], fresh, inverse)
+            further = torch.where(stale.unsqueeze(-1), -_times(inverse, rest), further)
+        step = torch.where(better.unsqueeze(-1), further, step)
+    return torch.where((done & ~lost).unsqueeze(-1), z, torch.nan)
+
+
+def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
+    return (matrices @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
 def _slopes(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
@@ -131,7 +151,8 @@ def _slopes(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
             slopes = torch.autograd.grad(totals, at, basis, is_grads_batched=True)[0].movedim(0, -2)
     except RuntimeError:  # within `torch.func`, or in inference mode
         return jacobian(residual, z)[0].detach()
-    return slopes if bool(torch.isfinite(slopes).all()) else jacobian(residual, z)[0].detach()
+    known = torch.isfinite(slopes).all(-1).all(-1) | ~torch.isfinite(residual(z.detach())).all(-1)
+    return slopes if bool(known.all()) else jacobian(residual, z)[0].detach()
 
 
 def _all(done: Tensor) -> bool:

@@ -20,11 +20,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchgco.base.errors import InputError, first_line
 from torchgco.base.version import VERSION
+from torchgco.experiments import new
 from torchgco.experiments.config.build import forget_composed, plain, recomposer
 from torchgco.experiments.config.checks import as_input_error, check_once, hydra_words
 from torchgco.experiments.config.groups import ENTRY, config_dir, register_resolver
 from torchgco.experiments.ending import Refused, ended, raised, say, silence
-from torchgco.experiments.flying.jobs import Report
+from torchgco.experiments.flying.jobs import SWEPT, Report, Scored
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.identity import decisive, digest, settings_of
 
@@ -61,10 +62,10 @@ def _described(_root_: Any) -> str:
 register_resolver("torchgco.folder", study_folder)
 
 
-def _task(config: DictConfig) -> Report:
+def _task(config: DictConfig) -> Report | Scored:
     job = HydraConfig.get()
     folder, overrides = Path(job.runtime.output_dir), list(job.overrides.task)
-    alone = job.mode == RunMode.RUN
+    alone, objective = job.mode == RunMode.RUN, OmegaConf.select(config, "study.objective")
     try:
         kind, named = ("run", job.run.dir) if alone else ("sweep", job.sweep.dir)
         if not named:
@@ -76,9 +77,14 @@ def _task(config: DictConfig) -> Report:
             done = run_study(
                 plain(config), folder, recomposer(overrides, job.runtime.config_sources),
                 lambda: _keep_configuration(config, folder), command=sys.argv[1:] if alone else ["-m", *overrides],
+                swept=tuple(SWEPT),
             )  # fmt: skip
+            report = Report(str(folder), overrides, done)
+            return report if objective is None else _scored(config, report)
     except (InputError, HydraException, OmegaConfBaseException) as error:
         _remove_empty(folder)
+        if not alone and objective is not None:  # a sweeper that steers would take a report for a number
+            raise as_input_error(error) from None
         if not alone:
             return Report(str(folder), overrides, False, str(as_input_error(error)))
         raise Refused(as_input_error(error)) from None
@@ -86,7 +92,17 @@ def _task(config: DictConfig) -> Report:
         if _is_of_launcher(error):
             return Report(str(folder), overrides, False, _stopped(error))
         raise
-    return Report(str(folder), overrides, done)
+
+
+def _scored(config: DictConfig, report: Report) -> Scored:
+    """The report with the number of the study."""
+    from torchgco.experiments.results.folder import TRIALS, read_trials
+    from torchgco.experiments.results.objective import objective_of
+
+    name, solver = config.study.objective, config.solver.name
+    number = objective_of(read_trials(Path(report.folder) / TRIALS, trust=True), name, solver)
+    say(f"{name} of {solver}: {number:g}")
+    return Scored(number, report)
 
 
 # Not as a decorator: launchers send the task to other processes by its name.
@@ -131,6 +147,8 @@ def _command() -> int:
     if "--version" in sys.argv[1:]:
         say(f"torchgco {VERSION}")
         return 0
+    if sys.argv[1:2] == ["new"]:
+        return new.main(sys.argv[2:])
     # Hydra would print and exit by itself; with this it raises its errors, and each is printed as one line.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     forget_composed()  # the files of conf/ may have changed since the last call

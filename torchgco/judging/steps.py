@@ -27,7 +27,7 @@ LARGE_ERROR = 0.1  # step errors above this are large
 # The same of order 1. Euler's difference is a quarter of the second difference of the states, half of their range at
 # most, which controls that change at every stage come close to without a stiff model.
 LARGE_OF_FIRST = 0.5
-LARGE_COST = 0.01  # step costs above this are large
+LARGE_COST = 0.01  # costs that are off by more than this share are, and the step costs by which they show
 # A method of order p changes the cost by c / N^p where nothing changes faster than within the whole duration: up to so
 # much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
 COARSE = 2.5
@@ -88,6 +88,7 @@ def step_errors(
     if not _halves(problem):
         return error
     order = ORDER_OF[problem.dynamics.integrator]
+    too_much = (COARSE / problem.stages.to(X.dtype) ** order).clamp(min=(1.0 - 0.5**order) * LARGE_COST)
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
             e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
@@ -95,7 +96,7 @@ def step_errors(
             error.step_error[rows], error.stage[rows], error.state[rows] = worst, index // problem.n, index % problem.n
             asked = torch.isfinite(worst)
             if doubted:
-                asked &= share.amax(-1).sum(-1) > LARGE_COST / ELASTIC
+                asked &= share.amax(-1).sum(-1) > too_much[rows] / ELASTIC
                 asked &= worst > (HARMLESS_OF_FIRST if order == 1 else 0.0)
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             chosen = asked.nonzero().flatten()
@@ -106,7 +107,6 @@ def step_errors(
                     problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()], costates
                 )
             error.step_cost[rows] = costs
-        too_much = (COARSE / problem.stages.to(X.dtype) ** order).clamp(min=LARGE_COST)
         large = LARGE_OF_FIRST if order == 1 else LARGE_ERROR
         error.large[:] = (error.step_error > large) | (error.step_cost > too_much)
     return error

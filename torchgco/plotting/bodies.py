@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import ConvexHull
 
 from torchgco.obstacles.measured import closest, segment_distance
+from torchgco.obstacles.shapes import RoundedBoxes
 
 Plane = tuple[int, int]  # the two coordinates that a map shows: (0, 1) from above, (0, 2) from the side
 ABOVE: Plane = (0, 1)
@@ -166,6 +167,22 @@ class Box:
 
 
 Solid = Ball | Box
+
+
+def solids(shapes: RoundedBoxes) -> list[Solid]:
+    """The obstacles of a problem."""
+    M, d = shapes.center.shape
+    velocities = np.zeros((M, d)) if shapes.velocity is None else shapes.velocity
+    bodies: list[Solid] = []
+    for i in range(M):
+        center, half, radius, velocity = shapes.center[i], shapes.half[i], float(shapes.radius[i]), velocities[i]
+        swing = None if shapes.sines is None else shapes.sines[:, i]
+        track = None if shapes.track is None else Track(shapes.track[:, i], shapes.step)
+        if half.any() or swing is not None:
+            bodies.append(Box(center, half, shapes.sides[i], radius, swing, velocity, track))
+        else:
+            bodies.append(Ball(center, radius, velocity, track))
+    return bodies
 
 
 def bodies(layouts: Mapping[str, np.ndarray], i: int) -> tuple[Solid, ...]:

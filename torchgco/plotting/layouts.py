@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
+from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
 from torchgco.plotting.gates import draw_gates
@@ -25,6 +26,7 @@ from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
 from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
+from torchgco.plotting.world import distances
 
 ROCK = "#CFC8BA"
 TALLEST = 1.5  # heights of a panel as a share of its width
@@ -57,6 +59,7 @@ def layout_grid(
     rows: int = 3,
     body: BoundBody | None = None,
     position: slice | None = None,
+    obstacles: Sequence[Sequence[Obstacles]] | None = None,
 ) -> Figure:
     """Maps of the first columns x rows layouts with each solver's trajectories; in space also their side views.
 
@@ -69,6 +72,7 @@ def layout_grid(
         columns: default: 4 in the plane, 3 in space.
         body: of the vehicle, in the place of vehicle_radius: the first solver's is drawn at some knots; None: a ball.
         position: its place in states; None: they begin with it.
+        obstacles: those of the problems that were solved, a batch of one for each layout; None: the layouts' own.
 
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
@@ -84,7 +88,7 @@ def layout_grid(
     for solver, states in paths.items():
         if states.ndim != 3 or len(states) != count:
             raise InputError(f"trajectories.{solver}", f"shape ({count}, N+1, n)", states.shape)
-    scene = scene_of(layouts, body, position)
+    scene = scene_of(layouts, body, position, obstacles)
     columns = columns or (4 if scene.dimension == 2 else 3)
     count = min(count, columns * rows)
     flights = flights_of(scene, {solver: states[:count] for solver, states in paths.items()}, trials)
@@ -106,6 +110,7 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     leads = {solver_colours(flights)[next(iter(flights), "")] if flights else EDGE: passes(scene, i, path)}
     for plane, ax in axes.items():
         drawn |= draw_obstacles(ax, scene, i, leads, plane)
+        drawn |= draw_others(ax, scene.others(i), flown(path), plane)
         if (field := scene.map_of(i)) is not None:
             drawn |= draw_map(ax, field, flown(path), plane, scene.margin, (ROCK, EDGE))
         drawn |= _paths(ax, scene, i, here, plane)
@@ -206,6 +211,24 @@ def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass
                 ax.add_collection(PolyCollection(shapes, zorder=0.2 + 0.1 * zorder, **looks[kind]), autolim=False)
                 kinds.add(kind)
     return kinds
+
+
+def draw_others(ax: Axes, others: Sequence[Obstacles], lead: np.ndarray, plane: Plane) -> set[str]:
+    """Fill where obstacles of other kinds than balls and boxes are at t = 0; returns the kind, where any is seen.
+
+    Args:
+        lead: (K, d), at whose mean height, or y, they are cut in space.
+    """
+    drawn = set[str]()
+    box = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    hidden = np.delete(np.arange(lead.shape[1]), plane)
+    depth = float(lead[:, hidden[0]].mean()) if len(hidden) and len(lead) else 0.0
+    for other in others:
+        x, y, apart = distances(other, box, plane, depth)
+        if bool((apart < 0).any()):
+            ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[ROCK], zorder=0.3)
+            drawn.add("others")
+    return drawn
 
 
 def moving_corners(scene: Scene, i: int, path: np.ndarray) -> list[np.ndarray]:
@@ -369,6 +392,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[DrawnFlight]], drawn: set[
     shapes: dict[str, Artist] = {
         "own": Patch(facecolor=ROCK, label=f"obstacle{where}"),
         "grown": Patch(label="plus the vehicle's radius", **outline),
+        "others": Patch(facecolor=ROCK, label="obstacle, plus the vehicle's radius"),
         "near": Patch(linestyle=":", label=f"near {first}, missed by this cut", **outline),
         "body": Patch(facecolor="none", edgecolor=INK, label=f"the body of {first}, at some knots"),
     }

@@ -28,6 +28,7 @@ from torchgco.plotting.layouts import (
     MARKED,
     ROCK,
     draw_obstacles,
+    draw_others,
     draw_targets,
     marker,
     moving_corners,
@@ -38,7 +39,7 @@ from torchgco.plotting.scene import flown, leaving, passes, view
 from torchgco.plotting.silhouettes import draw_body, extent
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
-from torchgco.plotting.world import World, distances, world_of
+from torchgco.plotting.world import World, world_of
 from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
@@ -228,14 +229,7 @@ class SceneMap:
             drawn |= draw_obstacles(ax, scene, 0, leads, plane)
             if scene.map is not None:
                 drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (ROCK, EDGE))
-        hidden = [i for i in range(self.box.shape[1]) if i not in plane]
-        depth = float(lead[:, hidden[0]].mean()) if hidden and len(lead) else 0.0
-        for other in self.world.others:
-            x, y, apart = distances(other, self.box[0], self.box[1], plane, depth)
-            if bool((apart < 0).any()):
-                ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[ROCK], zorder=0.3)
-                drawn.add("others")
-        return drawn
+        return drawn | draw_others(ax, self.world.others, lead, plane)
 
     def _course(self, ax: Axes, plane: Plane, course: Course) -> set[str]:
         """Draw a trajectory, where it touches something, and where it leaves the picture."""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from torchgco.judging import contact
 from torchgco.judging.contact import deepest, map_depth, pieces
 from torchgco.maps.distance import DistanceField
-from torchgco.obstacles.base import CONTACT_FACTOR
+from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import Solid, bodies
+from torchgco.plotting.bodies import Solid, bodies, solids
 from torchgco.plotting.silhouettes import balls_at
 from torchgco.scenarios.stored_maps import map_of
 
@@ -37,6 +38,9 @@ class Scene:
         body: the vehicle's, in the place of the margin; None: it is a ball.
         position: its place in the states of flights; None: they begin with it.
         gates: (L, G, d+1) centres and radii of balls to be passed in this order, nan where absent; or None.
+        sized: the vehicle's size is known, and with it what is in contact.
+        obstacles: those of each layout's problem, a batch of one each, which say what is in contact; None: its bodies
+            and its map do.
     """
 
     bodies: tuple[tuple[Solid, ...], ...]
@@ -50,7 +54,8 @@ class Scene:
     gates: np.ndarray | None = None
     body: BoundBody | None = None
     position: slice | None = None
-    sized: bool = True  # the vehicle's size is known, and with it what is in contact
+    sized: bool = True
+    obstacles: tuple[tuple[Obstacles, ...], ...] | None = None
 
     @property
     def dimension(self) -> int:
@@ -59,6 +64,11 @@ class Scene:
     def map_of(self, i: int) -> DistanceField | None:
         """The map of layout i; None where there is none."""
         return None if self.map is None else self.map.single(i)
+
+    def others(self, i: int) -> list[Obstacles]:
+        """The obstacles of layout i that are neither bodies nor a map."""
+        cores = [whole.inscribed for whole in (self.obstacles or {i: ()})[i]]
+        return [core for core in cores if core.map is None and core.shapes(0) is None]
 
 
 class Pass(NamedTuple):
@@ -69,11 +79,17 @@ class Pass(NamedTuple):
     distance: float  # m, the least between the surfaces at full radii
 
 
-def scene_of(layouts: Arrays, body: BoundBody | None = None, position: slice | None = None) -> Scene:
+def scene_of(
+    layouts: Arrays,
+    body: BoundBody | None = None,
+    position: slice | None = None,
+    obstacles: Sequence[Sequence[Obstacles]] | None = None,
+) -> Scene:
     """The scene of all layouts in the arrays of a layout file, for a vehicle that is a ball or has a body.
 
     Args:
         position: its place in the states of flights, and of starts and goals that aren't positions; None: the first.
+        obstacles: those of the problems that are made of the layouts, a batch of one each; None: the layouts' own.
     """
     count, d = len(layouts["radii"]), np.shape(layouts["centers"])[2]
 
@@ -83,7 +99,7 @@ def scene_of(layouts: Arrays, body: BoundBody | None = None, position: slice | N
         return np.broadcast_to(states[..., columns], (count, d))
 
     return Scene(
-        bodies=tuple(bodies(layouts, i) for i in range(count)),
+        bodies=tuple(bodies(layouts, i) if obstacles is None else _solids(obstacles[i]) for i in range(count)),
         start=point("start"),
         goal=point("goal"),
         margin=float(layouts.get("vehicle_radius", 0.0)) if body is None else 0.0,
@@ -95,7 +111,15 @@ def scene_of(layouts: Arrays, body: BoundBody | None = None, position: slice | N
         body=body,
         position=position,
         sized=body is not None or "vehicle_radius" in layouts,
+        obstacles=None if obstacles is None else tuple(map(tuple, obstacles)),
     )
+
+
+def _solids(obstacles: Sequence[Obstacles]) -> tuple[Solid, ...]:
+    """Those of the obstacles of one problem that are balls and boxes."""
+    cores = (whole.inscribed for whole in obstacles)
+    shapes = (core.shapes(0) for core in cores if core.map is None)
+    return tuple(solid for shape in shapes if shape is not None for solid in solids(shape))
 
 
 def gates_in(layouts: Arrays) -> np.ndarray | None:
@@ -140,6 +164,9 @@ def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None =
     Bodies touch, and distances are measured, as by the judge; between the knots the
     path is straight, and the states (N+1, n) change evenly, by which a vehicle's body turns.
     """
+    if scene.obstacles is not None:
+        kept = None if states is None else states[: len(flown(path))]
+        return contact.contacts(scene.obstacles[i], flown(path), scene.dt, kept)
     places, knots = pieces(flown(path))
     depth = np.full(max(len(places) - 1, 0), -np.inf)
     if len(places) == 0:

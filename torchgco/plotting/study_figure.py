@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import PercentFormatter
 
 from torchgco.base.errors import InputError
+from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE
 from torchgco.plotting.layouts import draw_layout, ends, ends_shown, flights_of, views
@@ -61,6 +63,7 @@ def study_figure(
     columns: Columns = "two",
     body: BoundBody | None = None,
     position: slice | None = None,
+    obstacles: Sequence[Sequence[Obstacles]] | None = None,
 ) -> Figure:
     """Maps of the first layouts, from above; rates with Wilson intervals; shares of layouts up to a cost.
 
@@ -68,7 +71,7 @@ def study_figure(
         layouts, trajectories, trials: of one scenario and model, as for `layouts.layout_grid`; with costs, too.
         summary: as `experiments.statistics.summarise` returns it.
         columns: of a paper in two columns that the figure spans.
-        body, position: of the vehicle, as for `layouts.layout_grid`.
+        body, position, obstacles: as for `layouts.layout_grid`.
 
     A layout counts for the costs of a solver where it was reached; a line ends at the share of these.
 
@@ -79,7 +82,7 @@ def study_figure(
         raise InputError("columns", "one or two", columns)
     if len(summary[["scenario", "model"]].drop_duplicates()) != 1:
         raise InputError("summary", "one scenario and model", summary[["scenario", "model"]].drop_duplicates().values)
-    form, scene = PRINTS[columns], scene_of(layouts, body, position)
+    form, scene = PRINTS[columns], scene_of(layouts, body, position, obstacles)
     count = min(len(layouts["radii"]), 2 * form.maps)
     flights = flights_of(scene, {name: np.asarray(X[:count]) for name, X in trajectories.items()}, trials)
     boxes = views(scene, flights, count, min(form.maps, count))

@@ -9,8 +9,7 @@ import torch
 
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.obstacles.shapes import RoundedBoxes
-from torchgco.plotting.bodies import Ball, Box, Plane, Solid, Track
+from torchgco.plotting.bodies import Plane, Solid, solids
 from torchgco.plotting.scene import Scene
 from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.problem import Problem
@@ -54,7 +53,7 @@ def world_of(problem: Problem, b: int) -> World:
         if core.map is not None:
             maps.append((vehicle, core.map.field.single(int(core.map.which[0]))))
         elif (shapes := core.shapes(0)) is not None:
-            by_radius.setdefault(vehicle, []).extend(_bodies(shapes))
+            by_radius.setdefault(vehicle, []).extend(solids(shapes))
         else:
             others.append(core)
     start = single.x0[:, single.position].cpu().numpy()
@@ -71,37 +70,19 @@ def world_of(problem: Problem, b: int) -> World:
     return World(tuple(scenes), tuple(others), tuple(single.obstacles), body_of(single))
 
 
-def _bodies(shapes: RoundedBoxes) -> list[Solid]:
-    M, d = shapes.center.shape
-    velocities = np.zeros((M, d)) if shapes.velocity is None else shapes.velocity
-    bodies: list[Solid] = []
-    for i in range(M):
-        center, half, radius, velocity = shapes.center[i], shapes.half[i], float(shapes.radius[i]), velocities[i]
-        swing = None if shapes.sines is None else shapes.sines[:, i]
-        track = None if shapes.track is None else Track(shapes.track[:, i], shapes.step)
-        if half.any() or swing is not None:
-            bodies.append(Box(center, half, shapes.sides[i], radius, swing, velocity, track))
-        else:
-            bodies.append(Ball(center, radius, velocity, track))
-    return bodies
-
-
-def distances(part: Obstacles, low: np.ndarray, high: np.ndarray, plane: Plane, z: float) -> tuple[np.ndarray, ...]:
+def distances(part: Obstacles, box: np.ndarray, plane: Plane, z: float) -> tuple[np.ndarray, ...]:
     """Grids (V, W) of two coordinates in a plane, m, and the least signed distance there from obstacles at t = 0.
 
     Args:
-        low, high: corners (d,), m, of what is seen.
+        box: corners (2, 2), m, of what is seen of the plane.
         z: the hidden coordinate, m.
     """
-    first, second = plane
     like = part.vehicle_radius
-    wide, high_ = (high - low)[[first, second]]
-    x, y = np.meshgrid(
-        np.linspace(low[first], high[first], GRID_POINTS),
-        np.linspace(low[second], high[second], max(2, round(GRID_POINTS * float(high_ / wide)))),
-    )
-    points = np.full((x.size, len(low)), z)
-    points[:, first], points[:, second] = x.ravel(), y.ravel()
+    low, high = box
+    rows = max(2, round(GRID_POINTS * float((high - low)[1] / (high - low)[0])))
+    x, y = np.meshgrid(np.linspace(low[0], high[0], GRID_POINTS), np.linspace(low[1], high[1], rows))
+    points = np.full((x.size, part.position.stop - part.position.start), z)
+    points[:, plane[0]], points[:, plane[1]] = x.ravel(), y.ravel()
     p = torch.as_tensor(points, dtype=like.dtype, device=like.device).unsqueeze(0)
     apart = part.signed_distance(p, p.new_zeros(p.shape[1]))[0]
     least = apart.amin(-1) if apart.shape[-1] else torch.full_like(p[0, :, 0], torch.inf)

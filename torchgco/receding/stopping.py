@@ -142,17 +142,19 @@ def _keep_states_within(problem: Problem, U: Tensor, rest: Tensor, first: Tensor
     bounds, (R, N, m), last = bounds_of(problem.constraints, "x"), U.shape, int(first.max())
     if not bounds or last == 0:
         return
-    lower, upper = (
-        torch.stack(torch.broadcast_tensors(*sides)) for sides in zip(*(b.over(N + 1) for b in bounds), strict=True)
-    )
-    lower, upper = (side.expand(-1, R, N + 1, -1) for side in (lower.amax(0, True), upper.amin(0, True)))
+    lower = U.new_full((R, N + 1, problem.n), -torch.inf)
+    upper = -lower
+    for each in bounds:  # those of users are of their states, which come first: solvers may have further ones
+        for side, other, tighter in zip((lower, upper), each.over(N + 1), (torch.maximum, torch.minimum), strict=True):
+            columns = side[..., : other.shape[-1]]
+            columns.copy_(tighter(columns, other))
     x = problem.x0
     for k in range(last):
         away = torch.diag_embed(U[:, k] - rest[:, k]).transpose(0, 1)  # (m, R, m)
         tried = torch.cat((rest[:, k].unsqueeze(0), rest[:, k] + away))
         still, *moved = problem.dynamics.step(x.repeat(m + 1, 1), tried.flatten(0, 1)).view(m + 1, R, -1)
         change = torch.stack(moved) - still
-        room = torch.where(change > 0, upper[:, :, k + 1] - still, lower[:, :, k + 1] - still)
+        room = torch.where(change > 0, upper[:, k + 1] - still, lower[:, k + 1] - still)
         share = torch.where(change == 0, 1.0, (room / change).nan_to_num(1.0)).clamp(0.0, 1.0).amin(-1)
         runs = k < first
         U[runs, k] = (rest[:, k] + share.T * (U[:, k] - rest[:, k]))[runs]

@@ -61,7 +61,8 @@ class Paths(Row):
     """Proposals along paths, where these lack or cost much further ones, and an attempt from the best.
 
     Args:
-        num_paths, roadmap, follow, relax_iterations, relax_top, max_penetration: as of `PathProposals`.
+        num_paths, follow, relax_iterations, relax_top, max_penetration: as of `PathProposals`.
+        roadmap: finds the paths.
         refined: candidates that are refined before they are compared; 1: the best is proposed as relaxed, only those of
             paths that led to no proposal are followed closer and refined, and where the attempt ends far from the goal,
             twice as many.

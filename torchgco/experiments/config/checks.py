@@ -201,7 +201,9 @@ def _unknown_key(error: BaseException, key: str) -> InputError:
         return InputError(key, f"{VEHICLE_GROUP}.{name}, as airframes have a group of their own", name)
     known = [str(other) for other in parent] if isinstance(parent, DictConfig) else []
     near = get_close_matches(name, known, n=1)
-    return InputError(key, "a key that the configuration has" + "".join(f", such as {other}" for other in near), name)
+    where = " (docs/options.md has the options of all solvers)" if key.startswith("solver.") else ""
+    expected = "a key that the configuration has" + "".join(f", such as {other}" for other in near)
+    return InputError(key, expected, name + where)
 
 
 def _joined(error: BaseException) -> str:

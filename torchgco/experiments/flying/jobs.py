@@ -12,13 +12,14 @@ import sys
 import tempfile
 import traceback
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
@@ -29,6 +30,7 @@ from torchgco.experiments.config.launching import jobs_at_once
 from torchgco.experiments.ending import Refused
 from torchgco.experiments.results.files import write
 
+SWEPT: list[str] = []  # keys that differ between the jobs of the sweep that this process's job is one of
 CUT_BY = ("study.jobs", "study.job")  # keys in which the jobs of one study differ
 
 
@@ -47,6 +49,20 @@ class Report:
     overrides: list[str]
     done: bool
     refused: str | None = None
+
+
+class Scored(float):
+    """The number of a study, as a sweeper takes it, with the report of its job."""
+
+    def __new__(cls, number: float, report: Report) -> Scored:
+        made = super().__new__(cls, number)
+        made.report = report
+        return made
+
+    report: Report
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Scored, (float(self), self.report)
 
 
 def _exits(method: Callable[..., None]) -> Callable[..., None]:
@@ -70,6 +86,7 @@ class Jobs(Callback):
 
     def __init__(self) -> None:
         self.reports: str | None = None
+        self.swept: list[str] = []
 
     @_exits
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -78,6 +95,7 @@ class Jobs(Callback):
         Exits with one line where the launcher isn't installed or its number of jobs is malformed.
         """
         _check(config)
+        self.swept = _swept(config)
         sweep = Path(config.hydra.sweep.dir).resolve()
         try:
             sweep.mkdir(parents=True, exist_ok=True)
@@ -86,10 +104,16 @@ class Jobs(Callback):
             raise InputError("hydra.sweep.dir", "a folder that can be made", error) from None
         weakref.finalize(self, shutil.rmtree, self.reports, ignore_errors=True)  # for launches that are interrupted
 
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Let the job know the keys of its sweep."""
+        SWEPT[:] = self.swept
+
     @_exits
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """In a job of a sweep: write its report."""
-        if self.reports is not None and isinstance(report := job_return._return_value, Report):
+        report = job_return._return_value
+        report = report.report if isinstance(report, Scored) else report
+        if self.reports is not None and isinstance(report, Report):
             text = json.dumps(asdict(report)).encode()
             write(Path(self.reports) / f"{config.hydra.job.num:06d}.json", lambda file: file.write(text))
 
@@ -108,7 +132,7 @@ class Jobs(Callback):
         cut = {report.folder: report for report in reports if not report.done and report.refused is None}
         for report in cut.values():
             try:
-                _finish(config, report)
+                _finish(config, report, self.swept)
             except InputError as error:
                 failed.append(str(error))
         if failed:
@@ -129,10 +153,18 @@ def _check(config: DictConfig) -> None:
     jobs_at_once(config.hydra.launcher)
 
 
-def _finish(config: DictConfig, report: Report) -> None:
+def _swept(config: DictConfig) -> list[str]:
+    """The keys that a sweep changes, on the command line or in the configuration of its sweeper."""
+    words = OverridesParser.create().parse_overrides(list(config.hydra.overrides.task))
+    nodes = [config.hydra.sweeper.get(name) for name in ("params", "search_space")]
+    keys = [word.key_or_group for word in words if word.is_sweep_override()]
+    return list(dict.fromkeys([*keys, *(str(key) for node in nodes for key in node or ())]))
+
+
+def _finish(config: DictConfig, report: Report, swept: Sequence[str]) -> None:
     """Write tables, summary and figures of a study whose shares are flown."""
     from torchgco.experiments.flying.study import run_study  # here, as jobs and workers import this module
 
     words = [word for word in report.overrides if not word.lstrip("+~").startswith(tuple(f"{key}=" for key in CUT_BY))]
     recompose = recomposer(words, config.hydra.runtime.config_sources)
-    run_study(recompose(None), Path(report.folder), recompose, command=sys.argv[1:], collect=True)
+    run_study(recompose(None), Path(report.folder), recompose, command=sys.argv[1:], collect=True, swept=swept)

@@ -39,8 +39,10 @@ from torchgco.experiments.results.identity import (
     settings_of,
 )
 from torchgco.experiments.results.lock import held
+from torchgco.experiments.results.objective import check_objective
 from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.success import with_success
+from torchgco.experiments.results.variants import values_of
 from torchgco.kernels import native
 from torchgco.missions import Mission
 from torchgco.problem.horizons import for_solvers
@@ -58,6 +60,7 @@ def run_study(
     accepted: Callable[[], None] = lambda: None,
     command: Sequence[str] = (),
     collect: bool = False,
+    swept: Sequence[str] = (),
 ) -> bool:
     """Fly, judge, write and report; returns False where a job flew its share of a study that others finish.
 
@@ -69,6 +72,7 @@ def run_study(
         accepted: called once the folder is known to be this study's; before that nothing is written.
         command: the command line, for run.json.
         collect: fly nothing, only judge, write and report what jobs flew.
+        swept: keys that the sweep of which this study is a part changes: columns of its trials.
 
     Raises:
         InputError: malformed configuration, a folder that holds another study or in which another process flies this
@@ -85,7 +89,7 @@ def run_study(
                 _fly_share(study, store)
                 ending.append("share flown")
                 return False
-            _fly_and_report(study, store, collect)
+            _fly_and_report(study, store, collect, swept)
             return True
 
 
@@ -102,11 +106,11 @@ def _fly_share(study: _Study, store: StudyFolder) -> None:
     say(f"{name}: {sum(map(len, missing.values()))} trials flown in {store.path}")
 
 
-def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
+def _fly_and_report(study: _Study, store: StudyFolder, collect: bool, swept: Sequence[str]) -> None:
     folder = store.path
     if store.finished(study.layouts):
         say(f"Already done in {folder}: nothing was flown again.\n")
-        _update_success(study, store)
+        _update(study, store, swept)
     else:
         missing = {name: store.missing(name) for name in study.solvers}
         count, left = study.layouts.count * len(study.solvers), sum(map(len, missing.values()))
@@ -118,6 +122,7 @@ def _fly_and_report(study: _Study, store: StudyFolder, collect: bool) -> None:
         _fly(study, store, missing, study.setup.solver_name)
         flown = [store.flown(name) for name in study.solvers]
         rows = pd.concat([rows for rows, _ in flown], ignore_index=True)
+        rows = rows.assign(**values_of(rows, study.manifest, swept))
         _finish(study, store, rows, np.stack([U for _, U in flown]))
     say(_report(study, folder))
     store.close()
@@ -177,6 +182,10 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
     tasks = Tasks(setup, setup.layouts())
     task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
     plan = plan_of(setup)
+    if (objective := configuration["study"]["objective"]) is not None:
+        check_objective(objective, setup.mission is not None)
+        if plan.jobs is not None:
+            raise InputError("study.objective", "null where jobs share a study: none of them has its number", objective)
     if setup.mission is not None:
         check_mission(setup.mission, task)
         if plan.explain:
@@ -303,12 +312,15 @@ def _fly_side_by_side(
     )
 
 
-def _update_success(study: _Study, store: StudyFolder) -> None:
-    """Judge the rows of a finished study again where the best costs of its layouts have changed since."""
+def _update(study: _Study, store: StudyFolder, swept: Sequence[str]) -> None:
+    """Judge the rows of a finished study again where best costs have changed since; add columns of a sweep."""
     trials = store.table()
-    new = with_success(trials, study.layouts, study.rivals)
-    if not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object)):
+    missing = [key for key in swept if key not in trials.columns]
+    new = with_success(trials, study.layouts, study.rivals).assign(**values_of(trials, study.manifest, missing))
+    changed = not new[list(JUDGED)].astype(object).equals(trials[list(JUDGED)].astype(object))
+    if changed or len(new.columns) > len(trials.columns):
         store.replace(new, study.layouts)
+    if changed:
         say("The best costs of the layouts have changed: best_cost and success were computed again.\n")
 
 

@@ -24,6 +24,8 @@ from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
+from torchgco.experiments.statistics.statistics import PAIR, swept_columns
+from torchgco.experiments.statistics.tables import csv_text
 from torchgco.export import export_c
 from torchgco.problem.sampled import TIME_COLUMN, sample_times, sampled
 from torchgco.problem.times import times
@@ -47,7 +49,7 @@ def write_export(
     Single trajectories have the columns of `Solution.trajectories`. Missions have those of the plant: states, the
     acceleration (differences of the velocities), the joint thrust, and the rotor speeds that are commanded; they are as
     they were logged, at the plant's time steps where the study kept these (up to four missions), else at its control
-    steps.
+    steps. The last columns of every row name the layout, the solver and the keys that the study's sweep changed.
 
     Args:
         output: a folder; None: `export` in that of the study.
@@ -67,6 +69,9 @@ def write_export(
             raise InputError(option, f"among {', '.join(map(str, known[:20]))} of the study", missing[0])
     if target.exists() and not target.is_dir():
         raise InputError("--output", "a folder", target)
+    trials = study.trials.set_index(["solver", "layout"], drop=False)
+    named = trials[[*PAIR, "solver", *swept_columns(trials)]]
+    rows: dict[Any, Any] = dict(zip(named.index, named.to_dict("records"), strict=True))
     tables, written = _missions if study.missions else _trajectories, list[Path]()
     for solver, number, columns in tables(study, rate, lambda solver, number: number in (layouts or ids)):
         if solver in (solvers or names):
@@ -75,7 +80,7 @@ def write_export(
             if bag:
                 write_bag(written[-1], {name: columns[name].to_numpy() for name in columns}, _position(study), bag)
             else:
-                text = columns.to_csv(index=False)
+                text = csv_text(columns.assign(**rows[solver, number]))
                 write(written[-1], lambda file, text=text: file.write(text.encode()))
     return written
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
@@ -28,8 +29,10 @@ from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TR
 from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
+from torchgco.experiments.statistics.power import in_words
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
-from torchgco.experiments.statistics.tables import OUTPUTS, format_frame
+from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
+from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
@@ -53,6 +56,7 @@ def write_report(
     tasks: Tasks | None = None,
     trials: pd.DataFrame | None = None,
     form: str = "table",
+    pdf: bool = False,
 ) -> str:
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
@@ -65,6 +69,7 @@ def write_report(
             known.
         trials: the table in that file, where it is known.
         form: of the table that is returned, one of OUTPUTS.
+        pdf: whether figures are PDF, as papers take them, instead of PNG.
 
     Raises:
         InputError: the table is missing, unreadable or empty, or the trajectories don't fit the layouts.
@@ -85,12 +90,15 @@ def write_report(
                 to_draw[f"study.{ending}"] = lambda: study_figure(
                     layouts, states, trials, parts[0].summary, printed, **how
                 )
+    if pdf:
+        to_draw = {name if name.startswith("study.") else f"{name}.pdf": figure for name, figure in to_draw.items()}
     draw({name: partial(_draw, folder, name, figure) for name, figure in to_draw.items()})
     return format_report(parts, form)
 
 
 def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any]]:
-    """The arrays of layouts as problems are made of them, the vehicle's body where it is no ball, and its position."""
+    """The arrays of layouts as problems are made of them, the vehicle's body where it is no ball, its position, and the
+    obstacles of each problem."""
     if tasks is None:
         return layouts.arrays(), {}
     groups = layouts.alike()
@@ -100,9 +108,12 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
     if first.dynamics.position is None:
         return arrays, how
     start, goal = (np.full((layouts.count, layouts.dimension), np.nan) for _ in range(2))
+    obstacles: list[tuple[Obstacles, ...]] = [()] * layouts.count
     for places, task in zip(groups, made, strict=True):
         start[places], goal[places] = task.problem.x0[:, task.problem.position].numpy(), task.goal.numpy()
-    return {**arrays, "start": start, "goal": goal}, how
+        for row, place in enumerate(places):
+            obstacles[place] = task.problem.take(torch.tensor([row])).obstacles
+    return {**arrays, "start": start, "goal": goal}, {**how, "obstacles": obstacles}
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
@@ -119,7 +130,7 @@ def drawings(part: Part) -> Drawings:
     mission, again = part.kind is MISSIONS, part.kind.summarise
     named, trials, summary, to_draw = "outcomes" if mission else "rates", part.trials, part.summary, {}
     swept = task_columns(trials)[len(TASK) :]
-    for name in swept:
+    for name in (name for name in swept if trials[name].nunique() > 1):
         others = [other for other in swept if other != name]
         rows, table = trials[trials[name].notna()], summary[summary[name].notna()]
         if len(table[[*TASK, *others]].drop_duplicates()) > FACETS:
@@ -158,11 +169,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
+    words = "one table of all trials in place of statistics: trials.csv, and on stdout with --format"
+    parser.add_argument("--long", action="store_true", help=words)
+    words = "print how many layouts tell two rates apart, such as 0.9 0.8, and no report"
+    parser.add_argument("--power", nargs=2, type=float, metavar="RATE", help=words)
+    parser.add_argument("--pdf", action="store_true", help="figures as PDF instead of PNG")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     return parser.run(arguments, _run)
 
 
 def _run(options: argparse.Namespace) -> int:
+    if options.power is not None:
+        say(in_words(*options.power))
+        return 0
     if not options.folders:
         raise InputError("DIR", "a study, or a folder of studies", "none")
     return _verify(options) if options.verify else _report(options)
@@ -181,7 +200,8 @@ def _report(options: argparse.Namespace) -> int:
     write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
-    say(write_report(output, trials=trials, form=options.format))
+    long = _long(output, trials, options.format) if options.long else None
+    say(long or write_report(output, trials=trials, form=options.format, pdf=options.pdf))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:
@@ -192,6 +212,13 @@ def _report(options: argparse.Namespace) -> int:
     for note in merged.attrs[UNFINISHED]:
         print(f"unfinished: {note}", file=sys.stderr)
     return 0
+
+
+def _long(output: Path, trials: pd.DataFrame, form: str) -> str:
+    """Write trials.csv, a row per solver and layout; returns what to print."""
+    table = plain(trials)
+    write(output / "trials.csv", lambda file: file.write(csv_text(table).encode()))
+    return f"{len(table)} trials, {len(table.columns)} columns" if form == "table" else format_frame(table, form)
 
 
 def _verify(options: argparse.Namespace) -> int:

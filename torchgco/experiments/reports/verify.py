@@ -38,6 +38,8 @@ from torchgco.experiments.results.kinds import joined, parts_of
 from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.experiments.results.runs import below
 from torchgco.experiments.results.success import with_success
+from torchgco.experiments.results.variants import values_of
+from torchgco.experiments.statistics.statistics import swept_columns
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.judging.judge import frame_columns, gates_passed, judge
 from torchgco.missions.contact import Contact
@@ -138,6 +140,8 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
             raise
         raise damaged(folder, f"can't be simulated again ({error})") from None
     computed = computed.join(_identity(manifest, vehicle, layouts, kept.index))
+    keys = values_of(kept.reset_index(), manifest, swept_columns(kept))
+    computed = computed.assign(**keys)
     differences = _differences(kept, computed)
     if differences.empty:  # nothing that can be computed differs: has any other column been changed?
         StudyFolder(folder, manifest).verify()

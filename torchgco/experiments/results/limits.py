@@ -110,8 +110,8 @@ def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) ->
         refuse(folder, f"{count} trajectories of {stages} stages, {size / 1e9:.3g} GB")
 
 
-def refuse(path: Path, got: str) -> NoReturn:
-    raise InputError("RUN", f"at most the {LARGEST_FILE / 1e9:.3g} GB {FILE_LIMIT}", f"{path} with {got}")
+def refuse(path: Path, got: str, field: str = "RUN") -> NoReturn:
+    raise InputError(field, f"at most the {LARGEST_FILE / 1e9:.3g} GB {FILE_LIMIT}", f"{path} with {got}")
 
 
 @contextmanager

@@ -17,8 +17,18 @@ from torchgco.base.errors import InputError
 from torchgco.experiments.results.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.results.runs import DIGESTS, MERGED, ROW, Run, find_runs
 from torchgco.experiments.results.success import judged
-from torchgco.experiments.results.variants import labels, task_of_runs
-from torchgco.experiments.statistics.statistics import PAIR, TASK, are_missions, grouped, task_columns
+from torchgco.experiments.results.variants import column, labels, task_of_runs
+from torchgco.experiments.statistics.statistics import (
+    OPTION,
+    PAIR,
+    TASK,
+    are_missions,
+    group_columns,
+    grouped,
+    plain,
+    swept_columns,
+    task_columns,
+)
 
 REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
 UNFINISHED = "unfinished"  # likewise: for each study that isn't finished, "96 of 128 trials in FOLDER"
@@ -65,6 +75,34 @@ def merge(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> pd.
     return merged
 
 
+def read(*folders: str | os.PathLike[str], trust: bool = False) -> pd.DataFrame:
+    """All trials of the studies in and below some folders as one table: a row per solver and layout.
+
+        table = torchgco.read("outputs")
+        table.groupby(["scenario.num_obstacles", "solver"])["reached"].mean()
+
+    The columns are those of a study, see the glossary of the manual, and the keys in which studies differ or that their
+    sweeps changed. A solver that flew with several settings has a name for each, a flight that several studies hold
+    counts once, and success is judged against the best cost of all of them. Studies that still run give what they have.
+
+    Args:
+        folders: studies, or folders of studies.
+        trust: whether files may take any memory.
+
+    Returns:
+        The table; its `attrs` have `merged_from`, the folders read, `repeated`, how many rows were left out, and
+        `unfinished`, a text for each study that is.
+
+    Raises:
+        InputError: a missing folder, folders without trials, a damaged file, one that takes more memory than it may
+            without `trust`, and different results for one flight.
+    """
+    merged = merge(folders, trust)
+    table = plain(merged)
+    table.attrs = merged.attrs
+    return table
+
+
 def _folder(run: Run) -> str:
     return run.folder.as_posix()
 
@@ -73,12 +111,13 @@ def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
     """The rows of all runs with swept variables and the columns OWN, and the variants that these number."""
     swept = task_of_runs(runs)
     tables = [
-        run.trials.assign(**{name: more[name].array for name in more.columns}, **{RUN: i})
+        _unswept(run).assign(**{name: more[name].array for name in more.columns}, **{RUN: i})
         for i, (run, more) in enumerate(zip(runs, swept, strict=True))
     ]
     rows = pd.concat(tables, ignore_index=True)
     rows = rows.assign(**{name: pd.Categorical.from_codes(*pd.factorize(rows[name])) for name in CODED if name in rows})
     settings = {digest(solver): solver for run in runs for solver in run.solvers.values()}
+    rows = rows.assign(**_options(rows, settings))
     numbers: dict[str, int] = {}
     code = np.zeros(len(rows), dtype=int)
     names = [RUN, "settings_digest", "device", "dtype", "version"]
@@ -87,6 +126,21 @@ def _tagged(runs: Sequence[Run]) -> tuple[pd.DataFrame, list[str]]:
     for group, (number, *key) in zip(groups, firsts.tolist(), strict=True):
         code[group] = numbers.setdefault(_variant(runs[number], settings, *key), len(numbers))
     return rows.assign(**{VARIANT: code}), list(numbers)
+
+
+def _unswept(run: Run) -> pd.DataFrame:
+    """The trials of a run without keys of its problems, where these are known from its configuration."""
+    keys = task_columns(run.trials)[len(TASK) :] if run.configuration else []
+    return run.trials.drop(columns=keys)
+
+
+def _options(rows: pd.DataFrame, settings: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """The columns of swept options of solvers, for all rows whose settings are known, by digest."""
+    options, columns = {code: flat(solver) for code, solver in settings.items()}, dict[str, Any]()
+    for name in (name for name in swept_columns(rows) if name.startswith(OPTION)):
+        pairs, key = zip(rows["settings_digest"], rows[name], strict=True), name.removeprefix(OPTION)
+        columns[name] = column([options[code].get(key, pd.NA) if code in options else cell for code, cell in pairs])
+    return columns
 
 
 def _variant(run: Run, settings: Mapping[str, dict[str, Any]], code: str, device: str, dtype: str, version: str) -> str:
@@ -107,7 +161,7 @@ def _without_repetitions(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFram
     Raises:
         InputError: two runs give one flight different content.
     """
-    content = [name for name in rows.columns if name not in INCIDENTAL | {RUN}]
+    content = [name for name in rows.columns if name not in INCIDENTAL | {RUN} and not name.startswith(OPTION)]
     flight = [*dict.fromkeys([*task_columns(rows), *ROW]), VARIANT, "layout_digest"]
     repeated = rows.duplicated(flight, keep=False)
     twins = rows[repeated]
@@ -168,12 +222,14 @@ def _sorted(rows: pd.DataFrame) -> pd.DataFrame:
     """By task and swept variables; solvers that are no baseline first, as a study has its own solver first."""
     flown = rows[[RUN, "solver"]].drop_duplicates()
     baselines = flown.loc[flown.duplicated(RUN), "solver"]  # not the first of their run
-    groups = grouped(rows, [*task_columns(rows), "solver"])
+    groups = grouped(rows, group_columns(rows))
     heads = rows.iloc[[group[0] for group in groups]].reset_index(drop=True)
     keys = pd.DataFrame({name: pd.factorize(heads[name])[0] for name in TASK})
     for name in task_columns(rows)[len(TASK) :]:
         keys[name] = heads[name].rank(method="dense", na_option="bottom")
     keys["baseline"] = heads["solver"].isin(baselines)
+    for name in (name for name in swept_columns(rows) if name.startswith(OPTION)):
+        keys[name] = heads[name].rank(method="dense", na_option="bottom")
     keys["solver"] = pd.factorize(heads["solver"])[0]
     order = keys.sort_values(list(keys.columns), kind="stable").index
     return rows.take(np.concatenate([groups[i] for i in order])).reset_index(drop=True)

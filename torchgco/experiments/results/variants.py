@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from torchgco.experiments.results.identity import CLOSED_LOOP, flat
+from torchgco.experiments.results.identity import CLOSED_LOOP, Manifest, flat
 from torchgco.experiments.results.runs import Run
-from torchgco.experiments.statistics.statistics import TASK, are_missions
+from torchgco.experiments.statistics.statistics import OPTION, TASK, are_missions, swept_columns
 
 # Prefixes of keys that define the problems and missions; `model` has keys for solvers, too.
-SWEPT = ("scenario.", "model.vehicle.", "mission.", "plant.")
+SWEPT = ("scenario.", "model.vehicle.", "vehicle.", "mission.", "plant.")
 NAME_KEYS = ("scenario.name", "scenario._target_", "model.vehicle.name", "model.vehicle._target_")  # have columns
+AIRFRAME = "model.vehicle.dynamics.airframe."  # whose keys are said in `vehicle`, and copied there
 FILE = "scenario.path"
 RUN_FOLDER = "hydra.run.dir"
 LABEL_SETTINGS = 3  # settings named in a label
@@ -25,9 +26,9 @@ LABEL_SETTINGS = 3  # settings named in a label
 def task_of_runs(runs: Sequence[Run]) -> list[pd.DataFrame]:
     """For each run the columns that its rows get: the swept variables of each row's (scenario, model).
 
-    A key is swept where all runs of a (scenario, model) have it, with different values; runs of missions are
-    compared with each other only, as others lack their keys. `scenario.path` is left out while the layouts agree. Runs
-    that differ in their layouts without such a key are distinguished by their folder.
+    A key is swept where all runs of a (scenario, model) have it, with different values, or where the command of one
+    swept it; runs of missions are compared with each other only, as others lack their keys. `scenario.path` is left out
+    while the layouts agree. Runs that differ in their layouts without such a key are distinguished by their folder.
     """
     tasks = [list(run.trials[TASK].drop_duplicates().itertuples(index=False, name=None)) for run in runs]
     missions = [bool(are_missions(run.trials).all()) for run in runs]
@@ -65,7 +66,9 @@ def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str
     all_keys = [_keys(run) for run in runs]
     known = [keys for keys in all_keys if keys]
     shared = [key for key in (known[0] if known else {}) if all(key in keys for keys in known)]
-    swept = [key for key in shared if key != FILE and len({_text(keys[key]) for keys in known}) > 1]
+    columns = {key for run in runs for key in swept_columns(run.trials)}
+    differs = lambda key: key in columns or len({_text(keys[key]) for keys in known}) > 1
+    swept = [key for key in shared if key != FILE and differs(key)]
     cells = [{key: keys[key] for key in swept if keys} for keys in all_keys]
     clusters = _clusters(runs, cells, tables)
     if FILE in shared and any(clusters):
@@ -78,9 +81,36 @@ def _swept(runs: Sequence[Run], tables: Sequence[pd.DataFrame]) -> list[dict[str
 
 
 def _keys(run: Run) -> dict[str, Any]:
-    parts = {name: run.configuration.get(name) for name in ("scenario", "model", *CLOSED_LOOP)}
+    return _of_problems(run.configuration)
+
+
+def _of_problems(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    parts = {name: configuration.get(name) for name in ("scenario", "vehicle", "model", *CLOSED_LOOP)}
     keys = flat({name: node for name, node in parts.items() if isinstance(node, Mapping)})
-    return {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAME_KEYS}
+    named = {key: value for key, value in keys.items() if key.startswith(SWEPT) and key not in NAME_KEYS}
+    return {key: value for key, value in named.items() if parts["vehicle"] is None or not key.startswith(AIRFRAME)}
+
+
+def values_of(rows: pd.DataFrame, manifest: Manifest, keys: Sequence[str]) -> dict[str, Any]:
+    """Columns for the rows of a study: of those keys that define its problems, missions or solvers.
+
+    An option `solver.KEY` has the value of each row's own solver, NA where that has no such option.
+    """
+    shared, columns = _of_problems(manifest.configuration), dict[str, Any]()
+    options = {name: flat(settings) for name, settings in manifest.solvers.items()}
+    for key in keys:
+        if key in shared:
+            columns[key] = column([shared[key]] * len(rows))
+        elif key.startswith(OPTION) and any(key.removeprefix(OPTION) in settings for settings in options.values()):
+            values = {name: settings.get(key.removeprefix(OPTION), pd.NA) for name, settings in options.items()}
+            columns[key] = column([values[name] for name in rows["solver"]])
+    return columns
+
+
+def column(values: Sequence[Any]) -> Any:
+    """Values of a key as an array: numbers where all are, else texts; NA where there is none."""
+    kind = _kind([value for value in values if value is not pd.NA])
+    return pd.array([_cell(value, value is not pd.NA, kind) for value in values], dtype=kind)
 
 
 def _clusters(

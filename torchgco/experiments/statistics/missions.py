@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from torchgco.experiments.statistics.statistics import grouped, numbers_of, rate_columns, summarise, task_columns
+from torchgco.experiments.statistics.statistics import group_columns, grouped, numbers_of, rate_columns, summarise
 from torchgco.missions.outcome import Outcome
 
 # Medians over the missions that reached the goal, and means over all.
@@ -33,7 +33,7 @@ def summarise_missions(trials: pd.DataFrame) -> pd.DataFrame:
         InputError: as `summarise`.
     """
     summary = summarise(trials)
-    rows = [_of_missions(trials.iloc[index]) for index in grouped(trials, [*task_columns(trials), "solver"])]
+    rows = [_of_missions(trials.iloc[index]) for index in grouped(trials, group_columns(trials))]
     return pd.concat([summary, pd.DataFrame(rows)], axis=1)
 
 

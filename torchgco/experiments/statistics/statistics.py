@@ -27,16 +27,27 @@ NEEDED_COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, PAPER_OUTCOME, "violatio
 NUMBER_COLUMNS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 TEXTS = ("string", "categorical", "bytes")  # kinds of columns without numbers, as pandas calls them
 INVALID = Status.INVALID_START.name
+OPTION = "solver."  # prefix of the columns that are options of a solver
 STATUS = "status_"  # prefix of the columns that count statuses
 CONFIDENCE = 0.95
 
 
 def task_columns(table: pd.DataFrame) -> list[str]:
-    """The columns that distinguish tasks: scenario, model, and the variables swept in a merged table.
+    """The columns that distinguish tasks: scenario, model, and swept variables of these.
 
-    The latter are named by their keys in the configuration, with a dot, which no column of a study has.
+    The latter are named by their keys in the configuration, with a dot, which no other column has.
     """
-    return [*TASK, *(str(name) for name in table.columns if "." in str(name))]
+    return [*TASK, *(name for name in swept_columns(table) if not name.startswith(OPTION))]
+
+
+def group_columns(table: pd.DataFrame) -> list[str]:
+    """The columns that distinguish rows of a summary: those of tasks, the solver, and its swept options."""
+    return [*task_columns(table), "solver", *(name for name in swept_columns(table) if name.startswith(OPTION))]
+
+
+def swept_columns(table: pd.DataFrame) -> list[str]:
+    """The columns that are keys of the configuration."""
+    return [str(name) for name in table.columns if "." in str(name)]
 
 
 def are_missions(trials: pd.DataFrame) -> pd.Series:
@@ -64,7 +75,7 @@ def plain(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
-    """One row per (scenario, model, solver), in order of appearance; in a merged table also per swept variable.
+    """One row per (scenario, model, solver) and swept variable, in order of appearance.
 
     Columns:
         n: trials.
@@ -87,7 +98,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
         InputError: `trials` is empty or lacks a column.
     """
     check_trials(trials)
-    names = [*task_columns(trials), "solver"]
+    names = group_columns(trials)
     groups = grouped(trials, names)
     values = _Values.of(trials, groups)
     keys = trials[names].iloc[[rows[0] for rows in groups]].reset_index(drop=True)

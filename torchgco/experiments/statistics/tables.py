@@ -194,7 +194,7 @@ def swept_of(table: pd.DataFrame) -> list[str]:
 
 def headers(swept: Sequence[str]) -> list[str]:
     """Swept variables as column heads: without the group of the key; of missions the last part alone."""
-    short = (name.removeprefix("scenario.").removeprefix("model.vehicle.") for name in swept)
+    short = (name.removeprefix("scenario.").removeprefix("model.").removeprefix("vehicle.") for name in swept)
     return [name.split(".")[-1] if name.startswith(("mission.", "plant.")) else name for name in short]
 
 

@@ -1,33 +1,32 @@
-/* The root of q equations in each lane, by Newton's method with corrections that are halved until the residual is less;
-   base/roots.py has the same in PyTorch. What a lane finds doesn't depend on the others: those that are done wait.
+/* The root of q equations in each lane, by Newton's method; base/roots.py has the same in PyTorch, and says when a step
+   serves. What a lane finds doesn't depend on the others: those that are done wait.
 
-       newton_state newton = newton_begin(q, trial, z, correction);          trial: the guess
-       do equation(trial, r, A);                                             its residual r (q), slopes A (q, q) by rows
-       while (newton_next(&newton, q, z, trial, correction, r, A, turns));   z: the root, NaN where none is found
+       newton_state newton = newton_begin(q, trial, z, step);     trial: the guess
+       do equation(trial, r, A);                                  its residual r (q), slopes A (q, q) row by row
+       while (newton_next(&newton, q, z, trial, step, further, r, A, turns, F, F_turns));   z: the root, or NaN
 
    q is a constant where these functions are called: their loops are short. */
 #pragma once
 #include "functions.h"
 
-#define NEWTON_NEAR (TGCO_IS_DOUBLE ? 0x1.428a2f98d7294p-35 : 0x1.965fea53d6e3ap-16) /* the precision to the power 2/3 */
 #define NEWTON_EPSILON (TGCO_IS_DOUBLE ? 0x1p-52 : 0x1p-23)
-#define NEWTON_MOST 30 /* evaluations of the equations */
+#define NEWTON_BY_ROUNDING (TGCO_IS_DOUBLE ? 0x1.428a2f98d7294p-35 : 0x1.965fea53d6e3ap-16) /* to the power 2/3 */
+#define NEWTON_MOST 30 /* evaluations of the equations after the first */
+#define NEWTON_SERVES_AGAIN 0.1 /* as in base/roots.py */
 
 typedef struct {
-    V size, share; /* of the residual at z, and of the correction that is tried */
-    V largest; /* entry of the correction */
-    I done;
+    V share, length; /* of the step that is tried, and its largest entry */
+    I done, lost;
     int evaluations;
 } newton_state;
 
-static inline newton_state newton_begin(int q, const V *trial, V *z, V *correction) {
+static inline newton_state newton_begin(int q, const V *trial, V *z, V *step) {
     newton_state s;
-    s.size = SET(INFINITY);
     s.share = SET(1.0);
-    s.largest = SET(0.0);
-    s.done = SET(0.0) != SET(0.0);
+    s.length = SET(INFINITY);
+    s.done = s.lost = SET(0.0) != SET(0.0);
     s.evaluations = 0;
-    for (int i = 0; i < q; i++) z[i] = trial[i], correction[i] = SET(0.0);
+    for (int i = 0; i < q; i++) z[i] = trial[i], step[i] = SET(0.0);
     return s;
 }
 
@@ -73,39 +72,55 @@ TGCO_INLINE void newton_solve_turned(int q, const V *A, const I *turns, V *b) {
     }
 }
 
-/* Whether a lane goes on, at the trial that is written. */
-TGCO_INLINE int newton_next(newton_state *s, int q, V *z, V *trial, V *correction, V *r, V *A, I *turns) {
-    V size = SET(0.0), of_trial = SET(0.0), largest = SET(0.0);
-    for (int i = 0; i < q; i++) {
-        ADD(size, r[i], r[i]);
-        of_trial = tgco_maximum(of_trial, tgco_fabs(trial[i]));
-    }
-    I first = NOT(s->size < SET(INFINITY)), better = (size < s->size) & NOT(s->done);
-    /* The next correction is less than rounding, if it is to this residual as the last one was to the one before. */
-    V least = SET(NEWTON_EPSILON) * of_trial;
-    I ends = better & NOT(first) & (size * s->largest * s->largest <= least * least * s->size);
-    s->size = tgco_choose(better, size, s->size);
-    s->share = tgco_choose(better, SET(1.0), SET(0.5) * s->share);
-    s->done = s->done | ends;
-    for (int i = 0; i < q; i++) z[i] = tgco_choose(better, trial[i], z[i]);
-    if (tgco_any(NOT(s->done))) {
-        newton_factor(q, A, turns);
-        newton_solve(q, A, turns, r);
+static inline V newton_largest(int q, const V *a) {
+    V largest = SET(0.0);
+    for (int i = 0; i < q; i++) largest = tgco_maximum(largest, tgco_fabs(a[i]));
+    return largest;
+}
+
+/* Whether a lane goes on, at the trial that is written. F is the factored A of z. */
+TGCO_INLINE int newton_next(
+    newton_state *s, int q, V *z, V *trial, V *step, V *further, V *r, V *A, I *turns, V *F, I *F_turns) {
+    V left, of_trial = newton_largest(q, trial);
+    I better, ends, stale;
+    for (int i = 0; i < q; i++) further[i] = -r[i];
+    if (s->evaluations == 0) {
+        left = newton_largest(q, r);
+        stale = better = left < SET(INFINITY);
+        s->done = s->lost = NOT(better);
+    } else {
+        newton_solve(q, F, F_turns, further);
+        left = newton_largest(q, further);
+        better = (left <= s->length) & NOT(s->done);
+        ends = better & (left * left <= SET(NEWTON_EPSILON) * of_trial * s->length);
         for (int i = 0; i < q; i++) {
-            correction[i] = tgco_choose(better, -r[i], correction[i]);
-            largest = tgco_maximum(largest, tgco_fabs(correction[i]));
+            V ahead = trial[i] + tgco_if(ends, further[i]);
+            z[i] = tgco_choose(better, ahead, z[i]);
         }
-        s->largest = tgco_choose(better, largest, s->largest);
-        ends = better & NOT(s->done) & (largest <= SET(NEWTON_NEAR) * of_trial);
-        for (int i = 0; i < q; i++) {
-            z[i] = tgco_choose(ends, z[i] + correction[i], z[i]);
-            trial[i] = tgco_fused(s->share, correction[i], z[i]);
-        }
+        s->share = tgco_choose(better, SET(1.0), SET(0.5) * s->share);
+        ends = ends | (NOT(better | s->done) & (s->length <= SET(NEWTON_BY_ROUNDING) * of_trial));
         s->done = s->done | ends;
+        stale = better & NOT(ends) & (left > SET(NEWTON_SERVES_AGAIN) * s->length);
     }
-    if (tgco_any(NOT(s->done)) && ++s->evaluations < NEWTON_MOST) return 1;
-    for (int i = 0; i < q; i++) z[i] = tgco_choose(s->done, z[i], SET(NAN));
-    return 0;
+    if (!tgco_any(NOT(s->done)) || s->evaluations++ == NEWTON_MOST) {
+        for (int i = 0; i < q; i++) z[i] = tgco_choose(s->done & NOT(s->lost), z[i], SET(NAN));
+        return 0;
+    }
+    if (tgco_any(stale)) {
+        newton_factor(q, A, turns);
+        for (int i = 0; i < q * q; i++) F[i] = tgco_choose(stale, A[i], F[i]);
+        for (int j = 0; j < q; j++) for (int i = j * q + j + 1; i < j * q + q; i++)
+            F_turns[i] = (stale & turns[i]) | (NOT(stale) & F_turns[i]);
+        for (int i = 0; i < q; i++) r[i] = -r[i];
+        newton_solve(q, F, F_turns, r);
+        for (int i = 0; i < q; i++) further[i] = tgco_choose(stale, r[i], further[i]);
+    }
+    for (int i = 0; i < q; i++) {
+        step[i] = tgco_choose(better, further[i], step[i]);
+        trial[i] = tgco_fused(s->share, step[i], z[i]);
+    }
+    s->length = newton_largest(q, step);
+    return 1;
 }
 
 /* to (q, count) = -A^-1 from, column by column, of a factored A. */

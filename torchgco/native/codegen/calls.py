@@ -125,8 +125,9 @@ class Ahead:
                 continue
             back = ca.SX.sym(f"v{i}", call.inputs.numel())
             upper = ca.SX.sym(f"h{i}", len(columns) * (len(columns) + 1) // 2)
-            place = self._places[i]
-            stages.append(NetStage(self.stages[place].source, by, ca.vertcat(back, upper), place))
+            ahead = self.stages[self._places[i]]
+            assert isinstance(ahead, NetStage)
+            stages.append(NetStage(ahead.source, by, ca.vertcat(back, upper), self._places[i]))
             pairs = [(p, q) for first, p in enumerate(columns) for q in columns[first:]]
             for (p, q), entry in zip(pairs, ca.vertsplit(upper), strict=True):
                 bent[p, q] += entry

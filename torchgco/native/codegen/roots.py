@@ -31,21 +31,21 @@ class Newton:
     @property
     def kept_bytes(self) -> int:
         """What it takes on the stack, of eight problems side by side."""
-        return 8 * 8 * self._size * (2 * self._size + 4)
+        return 8 * 8 * self._size * (4 * self._size + 5)
 
     def helpers(self, name: str, symbols: Sequence[Any]) -> list[str]:
         equation = emit.function(f"{name}_equation", [*symbols, self.outputs], self._residual, self._slopes)
         return ['#include "newton.h"', emit.function(f"{name}_guess", symbols, self._guess), equation]
 
     def lines(self, name: str, i: int, passed: str) -> list[str]:
-        q = self._size
+        q, work = self._size, f"step{i}, further{i}, r{i}, A{i}, turns{i}, F{i}, F_turns{i}"
         lines = [
-            f"V b{i}[{q}], trial{i}[{q}], correction{i}[{q}], r{i}[{q}], A{i}[{q * q}];",
-            f"I turns{i}[{q * q}];",
+            f"V b{i}[{q}], trial{i}[{q}], step{i}[{q}], further{i}[{q}], r{i}[{q}], A{i}[{q * q}], F{i}[{q * q}];",
+            f"I turns{i}[{q * q}], F_turns{i}[{q * q}];",
             f"{name}_guess({passed}, trial{i});",
-            f"newton_state newton{i} = newton_begin({q}, trial{i}, b{i}, correction{i});",
+            f"newton_state newton{i} = newton_begin({q}, trial{i}, b{i}, step{i});",
             f"do {name}_equation({passed}, trial{i}, r{i}, A{i});",
-            f"while (newton_next(&newton{i}, {q}, b{i}, trial{i}, correction{i}, r{i}, A{i}, turns{i}));",
+            f"while (newton_next(&newton{i}, {q}, b{i}, trial{i}, {work}));",
         ]
         if self._derived:
             lines.append(f"{name}_equation({passed}, b{i}, r{i}, A{i});")
