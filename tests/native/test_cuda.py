@@ -164,6 +164,9 @@ def test_few_problems_are_solved_by_the_cpu() -> None:
     with shimmed(least=3) as shims:
         torchgco.solve(problem, U0, "interior_point", verbose=False)
     assert not shims.made
+    with shimmed(least=8) as shims:  # as many threads as samples, of which there is one of the CPU for a problem
+        SAMPLERS["free"].improved(problem, U0, key(2))
+    assert "sample_fly" in shims.launched
 
 
 def refused(text: str) -> Any:

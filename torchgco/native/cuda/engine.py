@@ -20,8 +20,8 @@ from torchgco.native.compiler import NativeError
 from torchgco.native.cuda import launch
 from torchgco.native.cuda.source import Program, source
 
-# Problems or samples, for each thread of the CPU, from which on a device is asked. An estimate: 256 threads of an H200
-# are as fast as one core or two.
+# Problems or samples, for each thread of the CPU that has some, from which on a device is asked. An estimate: 256 threads
+# of an H200 are as fast as one core or two.
 LEAST = 512
 SIZES = {"double": 8, "float": 4}  # bytes
 
@@ -93,16 +93,17 @@ class Kernel:
         library = self.library
         return library.device.load(source(library.form, library.program, self.name, library.real))
 
-    def pays(self, threads: int) -> bool:
-        """Whether so many threads of the device are faster than the CPU."""
-        return not self._refused and threads >= self.library.device.least * torch.get_num_threads()
+    def pays(self, count: int, each: int = 1) -> bool:
+        """Whether the device, with `each` threads for a problem, is faster than the CPU with one at most."""
+        on_cpu = min(torch.get_num_threads(), count)
+        return not self._refused and count * each >= self.library.device.least * on_cpu
 
     def served(self, argument: Any, first: int, count: int) -> bool:
         """Call it on `count` problems; False where the CPU is to do that, as it is faster, or the device can't.
 
         A DeviceWarning says once why a device can't.
         """
-        if not self.pays(count * (argument.samples if isinstance(argument, c.Sampling) else 1)):
+        if not self.pays(count, argument.samples if isinstance(argument, c.Sampling) else 1):
             return False
         try:
             self._run(argument, first, first + count)
