@@ -20,8 +20,8 @@ from torchgco.native.compiler import NativeError
 from torchgco.native.cuda import launch
 from torchgco.native.cuda.source import Program, source
 
-# Problems or samples, for each thread of the CPU that has some, from which on a device is asked. An estimate: 256 threads
-# of an H200 are as fast as one core or two.
+# Problems or samples, for each thread of the CPU that has some, from which on a device is asked. An estimate: 256
+# threads of an H200 are as fast as one core or two.
 LEAST = 512
 SIZES = {"double": 8, "float": 4}  # bytes
 
