@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import partial
@@ -25,7 +26,7 @@ from torchgco.fleets.solve import solve_fleet
 from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import copied_to, costates, current, on_cpu, open_loop
+from torchgco.kernels import copied_to, costates, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
@@ -133,17 +134,16 @@ def solve(
     solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
         problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
-    problem, U0 = spared(problem, partial(_start, warm, solver, U0))
-    multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
-    watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-    try:
-        found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
-        watcher.end(found)
-    finally:
-        watcher.close()
-    _warn(problem, found, warm is None)
-    problem, found = _returned(asked, problem, found, name)
-    return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+    with served_by(asked.x0.device):
+        problem, U0 = spared(problem, partial(_start, warm, solver, U0))
+        multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
+        watched = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
+        with closing(watched):
+            found = solver.solve(problem, U0, seed, ids, multipliers, watched.callback, max_seconds, X0)
+            watched.end(found)
+        _warn(problem, found, warm is None)
+        problem, found = _returned(asked, problem, found, name)
+        return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
 def _returned(asked: Problem, problem: Problem, found: Solution, name: str | None) -> tuple[Problem, Solution]:

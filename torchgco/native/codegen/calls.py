@@ -215,7 +215,7 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
         symbols, passed = [*symbols, stage.outputs], f"{passed}, b{i}"
     helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED_AT))
     lines.append(f"    {name}_end({passed}, {', '.join(f'out{i}' for i in range(len(outputs)))});")
-    written = ", ".join(f"V *restrict out{i}" for i in range(len(outputs)))
+    written = ", ".join(f"OUT ALONE out{i}" for i in range(len(outputs)))
     head = f"TGCO_APART void {name}({arguments}, {written}) {{"
     return "\n".join([*dict.fromkeys(helpers), head, *lines, "}\n"])
 
