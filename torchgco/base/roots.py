@@ -13,8 +13,8 @@ from torch._C._functorch import is_functorch_wrapped_tensor  # type: ignore[impo
 from torchgco.base.autodiff import jacobian
 from torchgco.base.gradients import asks
 
-MOST_EVALUATIONS = 30  # 15 corrections from any guess that serves, and as many halvings
-# Of steps of this share of the unknowns, a power of the precision, rounding decides whether they serve: they end.
+MOST_EVALUATIONS = 60  # after the first: a step takes 4 to 12; from states far off some take more
+# Steps of this share of the unknowns, a power of the precision, end where the next one isn't far less: it is rounding.
 BY_ROUNDING = 2.0 / 3.0
 SERVES_AGAIN = 0.1  # slopes serve for another correction where it is this share of the last one
 
@@ -106,32 +106,34 @@ def _newton(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
 
     A step serves where the correction that the same slopes ask for after it is less than the step itself: the natural
     monotonicity test, which no scale of the residual changes (Deuflhard, Newton Methods for Nonlinear Problems, section
-    3.3). Slopes serve again where it is a tenth at most; the root is found where what is left is less than rounding.
+    3.3); or where the residual is less. Slopes serve again where it is a tenth at most; steps are halved with slopes of
+    their own point alone. The root is found where what is left is less than rounding.
     """
-    rest, epsilon = residual(z).detach(), torch.finfo(z.dtype).eps
+    rest, epsilon, step, trial = residual(z).detach(), torch.finfo(z.dtype).eps, torch.zeros_like(z), z
     lost = ~torch.isfinite(rest).all(-1)
-    done, share = lost, torch.ones_like(rest[..., 0])
-    inverse = torch.linalg.inv_ex(_slopes(residual, z))[0]
-    step = -_times(inverse, rest)
-    for _ in range(MOST_EVALUATIONS):
-        trial = z + share.unsqueeze(-1) * step
-        rest = residual(trial).detach()
-        further, length = -_times(inverse, rest), step.abs().amax(-1)
-        left, of_trial = further.abs().amax(-1), trial.abs().amax(-1)
-        better = (left <= length) & ~done
-        ends = better & (left * left <= epsilon * of_trial * length)
-        ends |= ~better & ~done & (length <= epsilon**BY_ROUNDING * of_trial)
+    done, begins, fresh = lost, ~lost, torch.zeros_like(lost)  # begins: slopes of the trial are taken without a test
+    inverse, share = z.new_zeros(*z.shape, z.shape[-1]), torch.ones_like(rest[..., 0])
+    size = torch.zeros_like(share)  # of the residual at z, squared
+    for _ in range(1 + MOST_EVALUATIONS):
+        further, length, less = -_times(inverse, rest), step.abs().amax(-1), rest.square().sum(-1)
+        left, of_trial, tested = further.abs().amax(-1), trial.abs().amax(-1), ~begins & ~done
+        better = begins | (tested & ((left <= length) | (less < size)))
+        ends = tested & better & (left * left <= epsilon * of_trial * length)
         ahead = trial + torch.where(ends.unsqueeze(-1), further, 0.0)
-        z = torch.where(better.unsqueeze(-1), ahead, z)
-        share, done = torch.where(better, 1.0, 0.5 * share), done | ends
+        z, size = torch.where(better.unsqueeze(-1), ahead, z), torch.where(better, less, size)
+        ends |= tested & ~(left <= SERVES_AGAIN * length) & (length <= epsilon**BY_ROUNDING * of_trial)
+        done = done | ends
         if _all(done):
             break
-        stale = better & ~ends & (left > SERVES_AGAIN * length)
+        stale = better & ~ends & (begins | (left > SERVES_AGAIN * length))
         if not _all(~stale):
-            fresh = torch.linalg.inv_ex(_slopes(residual, z))[0]
-            inverse = torch.where(stale[..., None, None], fresh, inverse)
+            inverse = torch.where(stale[..., None, None], torch.linalg.inv_ex(_slopes(residual, z))[0], inverse)
             further = torch.where(stale.unsqueeze(-1), -_times(inverse, rest), further)
+        begins = tested & ~better & ~ends & ~fresh
+        fresh, share = stale | (fresh & ~better), torch.where(better | begins, 1.0, 0.5 * share)
         step = torch.where(better.unsqueeze(-1), further, step)
+        trial = z + torch.where(begins, 0.0, share).unsqueeze(-1) * step
+        rest = residual(trial).detach()
     return torch.where((done & ~lost).unsqueeze(-1), z, torch.nan)
 
 

@@ -12,21 +12,24 @@
 
 #define NEWTON_EPSILON (TGCO_IS_DOUBLE ? 0x1p-52 : 0x1p-23)
 #define NEWTON_BY_ROUNDING (TGCO_IS_DOUBLE ? 0x1.428a2f98d7294p-35 : 0x1.965fea53d6e3ap-16) /* to the power 2/3 */
-#define NEWTON_MOST 30 /* evaluations of the equations after the first */
+#define NEWTON_MOST 60 /* evaluations of the equations after the first */
 #define NEWTON_SERVES_AGAIN 0.1 /* as in base/roots.py */
 #define NEWTON_PIVOT 0.1 /* of a column's largest entry a pivot may be (Duff, Erisman and Reid, Direct Methods, 5.2) */
 
 typedef struct {
-    V share, length; /* of the step that is tried, and its largest entry */
+    V share, length, size; /* of the step that is tried, its largest entry, and the residual's square at z */
+    I begins, fresh; /* slopes of the trial are taken without a test; F is that of z */
     I done, lost;
     int evaluations, turned; /* turned: whether F has exchanges */
 } newton_state;
 
 static inline newton_state newton_begin(int q, const V *trial, V *z, V *step) {
     newton_state s;
+    I none = SET(0.0) != SET(0.0);
     s.share = SET(1.0);
-    s.length = SET(INFINITY);
-    s.done = s.lost = SET(0.0) != SET(0.0);
+    s.length = s.size = SET(0.0);
+    s.begins = NOT(none);
+    s.fresh = s.done = s.lost = none;
     s.evaluations = s.turned = 0;
     for (int i = 0; i < q; i++) z[i] = trial[i], step[i] = SET(0.0);
     return s;
@@ -85,34 +88,35 @@ static inline V newton_largest(int q, const V *a) {
     return largest;
 }
 
-/* Whether a lane goes on, at the trial that is written. F is the factored A of z. */
+/* Whether a lane goes on, at the trial that is written. F is the factored A that steps come from. */
 TGCO_INLINE int newton_next(
     newton_state *s, int q, V *z, V *trial, V *step, V *further, V *r, V *A, I *turns, V *F, I *F_turns) {
-    V left, of_trial = newton_largest(q, trial);
-    I better, ends, stale;
+    V of_trial = newton_largest(q, trial), length = s->length, left = newton_largest(q, r);
     for (int i = 0; i < q; i++) further[i] = -r[i];
     if (s->evaluations == 0) {
-        left = newton_largest(q, r);
-        stale = better = left < SET(INFINITY);
-        s->done = s->lost = NOT(better);
+        s->done = s->lost = NOT(left < SET(INFINITY));
+        s->begins = NOT(s->lost);
     } else {
         newton_solve(q, F, s->turned ? F_turns : NULL, further);
         left = newton_largest(q, further);
-        better = (left <= s->length) & NOT(s->done);
-        ends = better & (left * left <= SET(NEWTON_EPSILON) * of_trial * s->length);
-        for (int i = 0; i < q; i++) {
-            V ahead = trial[i] + tgco_if(ends, further[i]);
-            z[i] = tgco_choose(better, ahead, z[i]);
-        }
-        s->share = tgco_choose(better, SET(1.0), SET(0.5) * s->share);
-        ends = ends | (NOT(better | s->done) & (s->length <= SET(NEWTON_BY_ROUNDING) * of_trial));
-        s->done = s->done | ends;
-        stale = better & NOT(ends) & (left > SET(NEWTON_SERVES_AGAIN) * s->length);
     }
+    V size = SET(0.0);
+    for (int i = 0; i < q; i++) ADD(size, r[i], r[i]);
+    I tested = NOT(s->begins | s->done), better = s->begins | (tested & ((left <= length) | (size < s->size)));
+    s->size = tgco_choose(better, size, s->size);
+    I ends = tested & better & (left * left <= SET(NEWTON_EPSILON) * of_trial * length);
+    for (int i = 0; i < q; i++) {
+        V ahead = trial[i] + tgco_if(ends, further[i]);
+        z[i] = tgco_choose(better, ahead, z[i]);
+    }
+    I serves = left <= SET(NEWTON_SERVES_AGAIN) * length;
+    ends = ends | (tested & NOT(serves) & (length <= SET(NEWTON_BY_ROUNDING) * of_trial));
+    s->done = s->done | ends;
     if (!tgco_any(NOT(s->done)) || s->evaluations++ == NEWTON_MOST) {
         for (int i = 0; i < q; i++) z[i] = tgco_choose(s->done & NOT(s->lost), z[i], SET(NAN));
         return 0;
     }
+    I stale = better & NOT(ends) & (s->begins | NOT(serves));
     if (tgco_any(stale)) {
         int turned = newton_factor(q, A, turns);
         if (turned && !s->turned) for (int i = 0; i < q * q; i++) F_turns[i] = s->lost & NOT(s->lost);
@@ -124,9 +128,13 @@ TGCO_INLINE int newton_next(
         newton_solve(q, F, s->turned ? F_turns : NULL, r);
         for (int i = 0; i < q; i++) further[i] = tgco_choose(stale, r[i], further[i]);
     }
+    s->begins = tested & NOT(better | ends | s->fresh); /* steps are halved with slopes of z alone */
+    s->fresh = stale | (s->fresh & NOT(better));
+    s->share = tgco_choose(better | s->begins, SET(1.0), SET(0.5) * s->share);
+    V share = tgco_choose(s->begins, SET(0.0), s->share);
     for (int i = 0; i < q; i++) {
         step[i] = tgco_choose(better, further[i], step[i]);
-        trial[i] = tgco_fused(s->share, step[i], z[i]);
+        trial[i] = tgco_fused(share, step[i], z[i]);
     }
     s->length = newton_largest(q, step);
     return 1;
