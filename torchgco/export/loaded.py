@@ -48,6 +48,7 @@ def load_c(folder: str | Path, name: str | None = None, period: float | None = N
         NativeError: there is no compiler, or it refuses the code.
     """
     folder = Path(folder)
+    folder = folder / "src" if (folder / "src").is_dir() else folder
     found = sorted(path.stem for path in folder.glob("*.h") if (folder / f"{path.stem}.c").is_file())
     if name is None and len(found) == 1:
         name = found[0]
