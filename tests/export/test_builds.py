@@ -1,4 +1,4 @@
-"""Folders for Arduino, PlatformIO and Zephyr: the same controller, whose sketches and samples run with stubs of both."""
+"""Folders for Arduino, PlatformIO and Zephyr: the same controller, whose sketches and samples run with stubs."""
 
 from __future__ import annotations
 

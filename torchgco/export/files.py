@@ -24,7 +24,7 @@ DISTURBED = 1e-3  # of the size of each state along the plan: by how much the te
 # Bytes of stack of a step: frames without matrices, and how many matrices of (n + m + 1)^2 numbers lie there at once.
 # tests/export/test_stack.py adds the frames of the longest chain of calls.
 FRAMES, MATRICES = 4096, 4
-PRINTING = 2048  # bytes of stack beside a step's, for the printf of a sample
+SPARE = 2048  # bytes of a sample's stack beside a step's, for libm, and for ellipsoids, which take 1.2 kB more
 Build = Literal["cmake", "arduino", "zephyr"]
 # The files beside NAME.h and NAME.c, of what builds a folder, and from which templates; the last two have both in src.
 TEMPLATES: dict[Build, dict[str, str]] = {
@@ -35,25 +35,12 @@ TEMPLATES: dict[Build, dict[str, str]] = {
         "examples/NAME_test/NAME_test.h": "test.c",
     },
     "zephyr": {
-        "zephyr/module.yml": "zephyr/module.yml", "CMakeLists.txt": "zephyr/CMakeLists.txt", "Kconfig": "zephyr/Kconfig",
+        "zephyr/module.yml": "zephyr/module.yml", "CMakeLists.txt": "zephyr/CMakeLists.txt",
+        "Kconfig": "zephyr/Kconfig",
         "samples/NAME/CMakeLists.txt": "zephyr/sample.cmake", "samples/NAME/prj.conf": "zephyr/prj.conf",
         "samples/NAME/sample.yaml": "zephyr/sample.yaml", "samples/NAME/src/main.c": "main.c",
         "samples/NAME/src/test.c": "test.c",
     },
-}  # fmt: skip
-# What README.md says of them.
-FILES: dict[Build, str] = {
-    "cmake": """| NAME.h, NAME.c | the controller: copy both into your project |
-| NAME_main.c | an example |
-| NAME_test.c | @PERIODS@ periods with what Python found: all bits, statuses, iterations |
-| CMakeLists.txt | `cmake -B build && cmake --build build && ctest --test-dir build` |""",
-    "arduino": """| src/NAME.h, src/NAME.c | the controller |
-| library.properties, library.json | copy the folder to `libraries` of Arduino's sketchbook, or to `lib` of a PlatformIO project |
-| examples/NAME | a sketch |
-| examples/NAME_test | a sketch: @PERIODS@ periods with what Python found: all bits, statuses, iterations |""",
-    "zephyr": """| src/NAME.h, src/NAME.c | the controller |
-| zephyr/module.yml, CMakeLists.txt, Kconfig | a module: name the folder in `EXTRA_ZEPHYR_MODULES`, and set `CONFIG_@SYMBOL@=y` |
-| samples/NAME | `west build -b BOARD samples/NAME`, an example; with `-- -DPROGRAM=test` @PERIODS@ periods with what Python found: all bits, statuses, iterations |""",
 }  # fmt: skip
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
 #include "NAME.h"
@@ -115,15 +102,17 @@ def write_files(exported: Exported, folder: Path, build: Build) -> Path:
     """Write them all; returns the folder."""
     periods, source = _periods(exported), "" if build == "cmake" else "src/"
     words: dict[str, Any] = {
-        "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION, "SYMBOL": f"TORCHGCO_{exported.name.upper()}",
-        "X0": _numbers(exported.kept.problem.x0), "EXAMPLE": EXAMPLE, "PERIODS": len(periods[2]),
-        "MILLISECONDS": max(1, round(1e3 * float(exported.stage))), "STACK": exported.stack + PRINTING,
+        "FILES": (HERE / f"{build}.md").read_text().rstrip(),  # before the others: it has marks of its own
+        "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
+        "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.kept.problem.x0),
+        "EXAMPLE": EXAMPLE, "PERIODS": len(periods[2]), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
+        "STACK": exported.stack + SPARE,
     }  # fmt: skip
     files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}
     for file, template in TEMPLATES[build].items():
         tables = {"TABLES": _vectors(*periods)} if template == "test.c" else {}
         files[file] = _filled(template, exported, **words, **tables)
-    files["README.md"] = _readme(exported, {"FILES": FILES[build], **words})  # which has marks of its own
+    files["README.md"] = _readme(exported, words)
     for file, text in files.items():
         path = folder / replaced(file, exported.name)
         path.parent.mkdir(parents=True, exist_ok=True)
