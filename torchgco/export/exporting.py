@@ -13,7 +13,7 @@ from torchgco.base.options import check_value
 from torchgco.compiled import Compiled, compile
 from torchgco.compiled.in_free_time import KeptInTime
 from torchgco.constraints.norms import within_norms
-from torchgco.export.files import Exported, write_files
+from torchgco.export.files import Build, Exported, write_files
 from torchgco.export.numbers import changing
 from torchgco.export.source import solver_source
 from torchgco.kernels import current, interior_of
@@ -34,6 +34,7 @@ def export_c(
     name: str = "controller",
     receding: bool = True,
     changes: Sequence[str] | None = None,
+    build: Build = "cmake",
 ) -> Path:
     """Write a problem's interior point as C99 that stands alone: no heap, no global state, no library but libm.
 
@@ -41,7 +42,8 @@ def export_c(
 
     NAME.h has the workspace and four functions, NAME.c all else in one file; NAME_main.c is an example, NAME_test.c
     makes 40 periods and compares all bits with Python's, CMakeLists.txt builds both, and README.md says how large it is
-    and which numbers may change. A step does what a step of `MPC` with `solver="interior_point"` does: it continues
+    and which numbers may change; `build` gives the same as a library of Arduino and PlatformIO or a module of Zephyr.
+    A step does what a step of `MPC` with `solver="interior_point"` does: it continues
     from the plan before, else begins again from what that leads to now, else from rest, and where all fail it holds the
     plan before with feedback. It doesn't search for other ways, nor for ways to come to rest.
 
@@ -52,6 +54,8 @@ def export_c(
         receding: each step's horizon begins a stage after that of the step before; the example and the test move so.
         changes: names of the numbers that steps may change; the others are constants. None: all that C reads as they
             are or copies of.
+        build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
+            "zephyr", a module with a sample. Of the last two NAME.h and NAME.c lie in `src`.
 
     Returns:
         the folder.
@@ -62,6 +66,7 @@ def export_c(
             change. No file is written then.
     """
     check_value(receding, bool, "receding")
+    check_value(build, Build, "build")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
         raise InputError("name", "a word of C, such as controller", shown(name))
     if isinstance(problem, Compiled):
@@ -76,7 +81,7 @@ def export_c(
         rest = _guess_at_rest(problem)
     solver = solver_source(kept, some, compiled.interior, rest)
     exported = Exported(compiled, kept, solver, some, name, receding)
-    return write_files(exported, Path(folder))
+    return write_files(exported, Path(folder), build)
 
 
 def _checked(problem: Problem) -> Problem:

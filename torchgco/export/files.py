@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,17 +21,43 @@ from torchgco.native.kept import Kept
 PERIODS = 40  # of the test
 EXAMPLE = 20  # of the example
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
+# Bytes of stack of a step: frames without matrices, and how many matrices of (n + m + 1)^2 numbers lie there at once.
+# tests/export/test_stack.py adds the frames of the longest chain of calls.
+FRAMES, MATRICES = 4096, 4
+SPARE = 4096  # bytes of a sample's stack beside those: for libm, and implicit steps, which take 2.3 kB more
+Build = Literal["cmake", "arduino", "zephyr"]
+# The files beside NAME.h and NAME.c, of what builds a folder, and from which templates; the last two have both in src.
+TEMPLATES: dict[Build, dict[str, str]] = {
+    "cmake": {"NAME_main.c": "main.c", "NAME_test.c": "test.c", "CMakeLists.txt": "CMakeLists.txt"},
+    "arduino": {
+        "library.properties": "arduino/library.properties", "library.json": "arduino/library.json",
+        "examples/NAME/NAME.ino": "arduino/main.ino", "examples/NAME_test/NAME_test.ino": "arduino/test.ino",
+        "examples/NAME_test/NAME_test.h": "test.c",
+    },
+    "zephyr": {
+        "zephyr/module.yml": "zephyr/module.yml", "CMakeLists.txt": "zephyr/CMakeLists.txt",
+        "Kconfig": "zephyr/Kconfig",
+        "samples/NAME/CMakeLists.txt": "zephyr/sample.cmake", "samples/NAME/prj.conf": "zephyr/prj.conf",
+        "samples/NAME/sample.yaml": "zephyr/sample.yaml", "samples/NAME/src/main.c": "main.c",
+        "samples/NAME/src/test.c": "test.c",
+    },
+}  # fmt: skip
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
 #include "NAME.h"
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(ARDUINO) && defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("fp-contract=off", "no-math-errno") /* Arduino gives a library no options */
+#endif
+typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];
 #define int64_t int32_t /* counters: no array is so long, and small processors take a tenth less code */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #pragma GCC diagnostic ignored "-Wunused-variable"
+#pragma GCC diagnostic ignored "-Wunused-const-variable"
 #endif
 #if defined(__clang__)
 #pragma clang diagnostic ignored "-Wunknown-warning-option"
@@ -67,21 +93,31 @@ class Exported:
         p = self.kept.problem
         return (p.N + 1) * p.n, p.N * p.m, p.N * p.m * p.n
 
+    @property
+    def stack(self) -> int:
+        """Bytes of stack of a step."""
+        return FRAMES + 8 * MATRICES * (self.kept.problem.n + self.kept.problem.m + 1) ** 2
 
-def write_files(exported: Exported, folder: Path) -> Path:
+
+def write_files(exported: Exported, folder: Path, build: Build) -> Path:
     """Write them all; returns the folder."""
-    name, periods = exported.name, _periods(exported)
-    files = {
-        f"{name}.h": _header(exported),
-        f"{name}.c": _code(exported),
-        f"{name}_main.c": _filled("main.c", exported, X0=_numbers(exported.kept.problem.x0), PERIODS=EXAMPLE),
-        f"{name}_test.c": _filled("test.c", exported, TABLES=_vectors(*periods), PERIODS=len(periods[2])),
-        "CMakeLists.txt": _filled("CMakeLists.txt", exported),
-        "README.md": _readme(exported, len(periods[2])),
-    }
-    folder.mkdir(parents=True, exist_ok=True)
+    periods, source = _periods(exported), "" if build == "cmake" else "src/"
+    words: dict[str, Any] = {
+        "FILES": (HERE / f"{build}.md").read_text().rstrip(),  # before the others: it has marks of its own
+        "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
+        "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.kept.problem.x0),
+        "EXAMPLE": EXAMPLE, "PERIODS": len(periods[2]), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
+        "STACK": exported.stack + SPARE,
+    }  # fmt: skip
+    files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}
+    for file, template in TEMPLATES[build].items():
+        tables = {"TABLES": _vectors(*periods)} if template == "test.c" else {}
+        files[file] = _filled(template, exported, **words, **tables)
+    files["README.md"] = _readme(exported, words)
     for file, text in files.items():
-        (folder / file).write_text(text)
+        path = folder / replaced(file, exported.name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
     return folder
 
 
@@ -162,7 +198,7 @@ def _vectors(states: list[np.ndarray], controls: list[np.ndarray], iterations: l
     )
 
 
-def _readme(exported: Exported, periods: int) -> str:
+def _readme(exported: Exported, words: dict[str, Any]) -> str:
     rows = [
         f"| `{m.name}` | {' x '.join(map(str, m.shape))} | `{m.full}` | {_shown(m)} | {_unit(m, exported)} |"
         for m in exported.changing.members
@@ -171,8 +207,8 @@ def _readme(exported: Exported, periods: int) -> str:
     count = sum(m.size for m in exported.changing.members) or 1
     workspace = 8 * (2 * X + 2 * U + K + lam + count + exported.solver.room) + 64
     return _filled(
-        "README.md", exported, VERSION=VERSION, TITLE=exported.title, PERIODS=periods, DT=exported.stage,
-        WORKSPACE=f"{workspace:,}", TABLES=f"{exported.solver.flash:,}", ROWS="\n".join(rows) or "| | | | | |",
+        "README.md", exported, **words, WORKSPACE=f"{workspace:,}", TABLES=f"{exported.solver.flash:,}",
+        BYTES=f"{exported.stack:,}", ROWS="\n".join(rows) or "| | | | | |",
     )  # fmt: skip
 
 

@@ -48,12 +48,14 @@ def load_c(folder: str | Path, name: str | None = None, period: float | None = N
         NativeError: there is no compiler, or it refuses the code.
     """
     folder = Path(folder)
-    found = sorted(path.stem for path in folder.glob("*.h") if (folder / f"{path.stem}.c").is_file())
+    headers = {path.stem: path for path in (*folder.glob("src/*.h"), *folder.glob("*.h"))}
+    found = sorted(stem for stem, path in headers.items() if path.with_suffix(".c").is_file())
     if name is None and len(found) == 1:
         name = found[0]
     if name not in found:
         raise InputError("folder", "one with a controller of `export_c`", f"{', '.join(found) or 'none'} in {folder}")
-    return LoadedController((folder / f"{name}.h").read_text(), (folder / f"{name}.c").read_text(), name, period)
+    code = headers[name].with_suffix(".c").read_text()
+    return LoadedController(headers[name].read_text(), code, name, period)
 
 
 class LoadedController:

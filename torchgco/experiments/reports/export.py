@@ -27,6 +27,7 @@ from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.experiments.statistics.statistics import PAIR, swept_columns
 from torchgco.experiments.statistics.tables import csv_text
 from torchgco.export import export_c
+from torchgco.export.files import Build
 from torchgco.problem.sampled import TIME_COLUMN, sample_times, sampled
 from torchgco.problem.times import times
 
@@ -176,6 +177,10 @@ def _parser() -> RunParser:
         nargs="*",
         help="numbers that the C may be given between steps; default: all that can",
     )
+    builds = list(get_args(Build))
+    parser.add_argument(
+        "--build", metavar="KIND", choices=builds, help=f"what builds the C: {', '.join(builds)}; default: {builds[0]}"
+    )
     return parser
 
 
@@ -187,6 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     if options.c is not None:
         return _write_c(options)
+    if options.build is not None:
+        raise InputError("--build", "none without --c", options.build)
     if len(options.run) > 1:
         raise InputError("RUN", "one folder; several words with --c", options.run[1])
     run = Path(options.run[0])
@@ -218,7 +225,7 @@ def _write_c(options: argparse.Namespace) -> int:
     if len(options.layout) > 1 or layout not in ids:
         raise InputError("--layout", f"one of {', '.join(map(str, ids[:20]))}", options.layout[-1])
     problem = vehicle.task(layouts.take(np.array([ids.index(layout)]))).problem
-    written = export_c(problem, options.output or output, name, changes=options.changes)
-    size = sum(path.stat().st_size for path in written.iterdir())
+    written = export_c(problem, options.output or output, name, changes=options.changes, build=options.build or "cmake")
+    size = sum(path.stat().st_size for path in written.rglob("*") if path.is_file())
     say(f"{written}: {name}.c, {size / 1e6:.2f} MB")
     return 0

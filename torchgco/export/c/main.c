@@ -1,4 +1,4 @@
-/* An example: @PERIODS@ periods of a vehicle that does what the plan says. */
+/* An example: @EXAMPLE@ periods of a vehicle that does what the plan says. */
 #include "NAME.h"
 #include <math.h>
 #include <stdio.h>
@@ -9,7 +9,7 @@ int main(void) {
     double x[NAME_NX] = {@X0@}, u[NAME_NU];
     int failed = 0;
     NAME_init(&workspace);
-    for (int period = 0; period < @PERIODS@; period++) {
+    for (int period = 0; period < @EXAMPLE@; period++) {
         int status = NAME_step(&workspace, x, NAME_STAGES, INFINITY, u);
         printf("%2d: status %d, %2d iterations, u", period, status, workspace.iterations);
         for (int j = 0; j < NAME_NU; j++) printf(" % .6f", u[j]);

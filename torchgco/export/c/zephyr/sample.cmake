@@ -1,0 +1,6 @@
+cmake_minimum_required(VERSION 3.20)
+list(APPEND EXTRA_ZEPHYR_MODULES ${CMAKE_CURRENT_SOURCE_DIR}/../..)
+find_package(Zephyr REQUIRED HINTS $ENV{ZEPHYR_BASE})
+project(NAME_sample C)
+set(PROGRAM main CACHE STRING "main: an example; test: compares all bits with Python's")
+target_sources(app PRIVATE src/${PROGRAM}.c)
