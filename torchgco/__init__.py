@@ -65,6 +65,7 @@ from torchgco.dynamics import (
 from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.judging import judge
+from torchgco.guesses import Guess
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
@@ -95,7 +96,7 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
+    "solve", "Guess", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
     "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",

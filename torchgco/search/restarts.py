@@ -138,6 +138,12 @@ class Restarts(Solver):
         short = {name: replace(row, starts=0) for name, row in rows.items() if isinstance(row, Tighten)}
         return replace(self, passes=Passes(rows | short))
 
+    def from_guesses(self, problem: Problem) -> Solver:
+        """The interior point where the time is free; among obstacles the local solver, unguided; else the same."""
+        if problem.time is not None:
+            return self.interior
+        return replace(self.local, guidance=None) if problem.geometric else self
+
     def horizon(self, problem: Problem) -> Horizon | None:
         """What `Solution.explain` asks of the horizon of a batch of one; see `reach.horizon_of`."""
         return horizon_of(problem)

@@ -328,6 +328,11 @@ class Solver(Brief, Checked):
         """The same solver, which keeps a record of what it does, where it can; `Solution.explain` tells it."""
         return self
 
+    def from_guesses(self, problem: Problem) -> Solver:
+        """What solves the user's problem from each of several guesses: a local solver, after which this one goes on
+        from the best, or this one."""
+        return self
+
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
         """For a planner that solves again and again: what it asks for a new plan, and what continues a previous one.
 
