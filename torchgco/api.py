@@ -22,6 +22,7 @@ from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.solve import solve_fleet
 from torchgco.guesses import Guess, guesses_of, solve_guesses
 from torchgco.kernels import copied_to, current, on_cpu, open_loop
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
@@ -112,9 +113,7 @@ def solve(
             end. None: in a terminal and in a notebook a bar on stderr, once it takes 2 s; False: nothing.
         smoothing: mu > 0 in units of the cost: the minimum of J_var - mu sum log(-c) over all rows c <= 0 near the
             solver's, FEASIBLE, whose gradients are smooth; `solution.reason` where none is found. None: the solver's.
-        guesses: several guesses per problem, in the place of U0, X0 and warm: a `Guess` each, a dict of its arguments,
-            or an earlier solution. All are solved in one batch, and the best result of each problem is kept:
-            `solution.guess` says from which, `solution.guesses.to_frame()` what became of each.
+        guesses: several per problem, in the place of U0, X0 and warm; see `Guess`. The best result of each is kept.
 
     Raises:
         InputError: U0, ids, warm, X0 or an argument don't fit, no preset has this name, the solver can't begin with X0,
@@ -136,17 +135,30 @@ def solve(
     problem, U0 = spared(problem, partial(_start, warm, solver, U0))
     multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
     watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-    try:
-        if tried:
-            found = solve_guesses(solver, problem, tried, U0, seed, ids, watcher.callback, max_seconds)
-        else:
-            found = solver.solve(problem, U0, seed, ids, multipliers, watcher.callback, max_seconds, X0)
-        watcher.end(found)
-    finally:
-        watcher.close()
+    found = _watched(watcher, solver, tried, (problem, U0, seed, ids, multipliers), max_seconds, X0)
     warn_of(problem, found, warm is None)
     problem, found = _returned(asked, problem, found, name)
     return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+
+
+def _watched(
+    watcher: Watcher,
+    solver: Solver,
+    guesses: Sequence[Guess] | None,
+    call: tuple[Problem, Tensor, int, Tensor | None, Multipliers | None],
+    max_seconds: float | None,
+    X0: Tensor | None,
+) -> Solution:
+    """The solution of a call, from several guesses where there are some, under the eyes of the watcher."""
+    try:
+        if guesses is None:
+            found = solver.solve(*call, watcher.callback, max_seconds, X0)
+        else:
+            found = solve_guesses(solver, guesses, *call[:4], watcher.callback, max_seconds)
+        watcher.end(found)
+        return found
+    finally:
+        watcher.close()
 
 
 def _returned(asked: Problem, problem: Problem, found: Solution, name: str | None) -> tuple[Problem, Solution]:

@@ -32,7 +32,11 @@ TRAJECTORY = "X", "U", "K", "d", "multipliers", "cost", "violation", "status"
 class Guess(PerElement):
     """Where a solve begins; what is None, it chooses as it does without a guess.
 
-        torchgco.solve(problem, guesses=[Guess(U0=left), Guess(U0=right), Guess()])
+        torchgco.solve(problem, guesses=[Guess(U0=left), {"U0": right}, Guess(), solution])
+
+    A dict of the arguments serves as well, and an earlier solution, without its multipliers. All are solved in one
+    batch, and the best result of each problem is kept: `solution.guess` says from which, and
+    `solution.guesses.to_frame()` what became of each.
 
     Args:
         U0: controls (B, N, m), or (N, m) for all problems.
@@ -96,8 +100,8 @@ def guesses_of(guesses: Any, problem: Problem) -> tuple[Guess, ...]:
 
 def solve_guesses(
     solver: Solver,
-    problem: Problem,
     guesses: Sequence[Guess],
+    problem: Problem,
     default: Tensor,
     seed: int,
     ids: Tensor | None,

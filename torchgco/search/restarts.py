@@ -139,10 +139,10 @@ class Restarts(Solver):
         return replace(self, passes=Passes(rows | short))
 
     def from_guesses(self, problem: Problem) -> Solver:
-        """The interior point where the time is free; among obstacles the local solver, unguided; else the same."""
-        if problem.time is not None:
-            return self.interior
-        return replace(self.local, guidance=None) if problem.geometric else self
+        """Without obstacles in a fixed time the same; else the interior point, without a compiler the local solver."""
+        if problem.time is None and not problem.geometric:
+            return self
+        return self.interior if Converge.worth(problem) else replace(self.local, guidance=None)
 
     def horizon(self, problem: Problem) -> Horizon | None:
         """What `Solution.explain` asks of the horizon of a batch of one; see `reach.horizon_of`."""
