@@ -43,6 +43,7 @@ from torchgco.constraints import (
     ControlBounds,
     FunctionConstraint,
     Gates,
+    Integral,
     Link,
     NormBounds,
     RateBounds,
@@ -92,7 +93,7 @@ __all__ = [  # noqa: RUF022
     "QuadrotorPlanning", "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "Ellipsoids", "OscillatingBoxes", "Moved", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone",
-    "Gates", "Separation", "Link", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "Gates", "Separation", "Link", "Integral", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it

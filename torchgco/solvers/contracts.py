@@ -307,7 +307,7 @@ class Solver(Brief, Checked):
             able = "interior_point or, without obstacles, gco; or ipopt"
             raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)
         if call.problem is not problem and (carried := carried_of(problem)) is not None:
-            X0 = torch.cat((X0, carried.along(X0, call.U0)), dim=-1)
+            X0 = torch.cat((X0, carried.along(X0, call.U0, problem.along)), dim=-1)
         return replace(call, X0=X0)
 
     def frees_start(self, problem: Problem) -> bool:
