@@ -58,8 +58,8 @@ def export_c(
 
     Raises:
         InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
-            start, horizons, `RateBounds`, `Link` or `Integral`, single precision, code that can't be compiled; a number that can't
-            change. No file is written then.
+            start, horizons, `RateBounds`, `Link` or `Integral`, single precision, code that can't be compiled; a number
+            that can't change. No file is written then.
     """
     check_value(receding, bool, "receding")
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
