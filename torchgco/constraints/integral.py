@@ -37,7 +37,8 @@ class Integral(Constraint):
     From knot 0 to the last one, of each problem its own. A stage is integrated with the states by the model's own
     integrator, or where the model makes whole steps counts dt times the value at its knot. Solvers see the integral up
     to each knot as a further state after all others, as do callbacks and solvers of your own; problem and solution have
-    the problem's own states. Judge and certificate integrate along the states themselves.
+    the problem's own states. Judge and certificate integrate along the states themselves. Compiled problems and
+    exported C don't take it.
 
     Args:
         function: of x (..., n), u (..., m), a number for each, (...), per second. It may take k, the stage.
