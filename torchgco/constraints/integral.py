@@ -13,8 +13,9 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions, check_finite, per_row
 from torchgco.base.values import Values, asks_for_knot, bound_values
-from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.carried import Carried, Carrying
+from torchgco.constraints.link import CarriedRows
 from torchgco.dynamics.integrators import INTEGRATORS
 
 # Rows (..., p) of integrals (..., 1), by the limits that there are.
@@ -117,7 +118,9 @@ class Integral(Constraint):
         return Carried(torch.zeros_like(x0[:, :1]), self._summed)
 
     def with_carried(self, first: int) -> Constraint:
-        return _Rows(ROWS[self._given], self.sense, self.knots, name=self.name, values=self._limits(), place=first)
+        limits = self._limits()
+        rows, state = ROWS[self._given], torch.tensor([first], device=limits.rows[0].device)
+        return CarriedRows(rows, self.sense, self.knots, name=self.name, values=limits, places=(state,))
 
 
 @dataclass(frozen=True)
@@ -172,20 +175,3 @@ class _Summed(Carrying):
             got = tuple(rate.shape) if isinstance(rate, Tensor) else shown(rate)
             raise InputError(f"{self.name}.function", f"a number for each, {tuple(x.shape[:-1])}", got)
         return rate.unsqueeze(-1)
-
-
-@dataclass(frozen=True)
-class _Rows(FunctionConstraint):
-    """The rows of an integral that is a state."""
-
-    place: int = 0  # which state
-
-    def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
-        (x,) = arguments
-        return self.values.call(self.function, x[..., self.place : self.place + 1])
-
-    def with_more(self, n: int, m: int) -> Constraint:
-        return self
-
-    def in_free_time(self, n: int, m: int, later: int) -> Constraint:
-        return self
