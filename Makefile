@@ -9,7 +9,7 @@
 #             forty minutes on two cores)
 # make floors   drawn floor plans, gco against a grid path that is pursued (ARGS="--maps DIR": real maps, too): some minutes
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
-#                  benchmark-gpu: the same on a GPU
+#                  benchmark-gpu: kernels' bits and speed on a GPU (ten minutes), then the same there
 # make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
 #              make paper: the paper's figures, tables and missions by our solvers, in benchmarks/results/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
@@ -103,6 +103,7 @@ benchmark: $(PEERS)
 	$(SPEED) $(ARGS)
 
 benchmark-gpu: $(PEERS)
+	$(BIN)/python -m benchmarks.gpu --write
 	$(SPEED) --device cuda $(ARGS)
 
 docs: $(DEV)

@@ -1,4 +1,5 @@
-"""On a CUDA device PyTorch's kernels give the answers of the CPU's, within rounding; skipped without a device.
+"""On a CUDA device PyTorch's kernels give the answers of the CPU's, within rounding, and those in CUDA C++ the bits of
+C; skipped without a device.
 
 `tests/test_other_device.py` finds mixed devices without hardware. These are the operations themselves.
 """
@@ -6,7 +7,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -34,7 +37,10 @@ from torchgco import (
     certify,
     judge,
 )
+from torchgco.base.draws import DrawKey
 from torchgco.kernels import use_native
+from torchgco.native.cuda.compiler import Loaded, available
+from torchgco.native.cuda.engine import OnDevice, working_on
 
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 KINDS = "spheres", "boxes", "capsules", "oscillating", "map", "states", "function"
@@ -150,6 +156,39 @@ def test_c_on_the_cpu_solves_problems_of_the_device() -> None:
         grads.append((solution.X.detach().cpu(), x0.grad.cpu()))
     assert torch.equal(grads[0][0], grads[1][0])
     torch.testing.assert_close(grads[0][1], grads[1][1], rtol=1e-6, atol=1e-9)
+
+
+def on_the_device() -> AbstractContextManager[None]:
+    """A block in which kernels of the device serve however few problems."""
+    use_native(True)
+    return working_on(OnDevice(partial(Loaded, device=torch.device("cuda")), 1))
+
+
+needs_kernels = pytest.mark.skipif(not available(), reason="no cuda-core")
+
+
+@needs_kernels
+@pytest.mark.parametrize("solver", ["al_ilqr", "interior_point", "gco"])
+def test_kernels_of_the_device_have_the_bits_of_c(solver: str) -> None:
+    found = []
+    for block in (nullcontext, on_the_device):
+        use_native(True)
+        with block():
+            found.append(torchgco.solve(*discs("cpu", 40), solver=solver, verbose=False))
+    assert torch.equal(found[0].X, found[1].X) and torch.equal(found[0].cost, found[1].cost)
+
+
+@needs_kernels
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-5)])
+def test_samples_on_the_device_have_the_weights_of_c(dtype: str, tolerance: float) -> None:
+    """But for exp, which rounds otherwise there."""
+    sampler, found = MPPI(samples=1000, rounds=3, noise_knots=5, elite=4, covariance=0.5, dtype=dtype), []
+    for block in (nullcontext, on_the_device):
+        use_native(True)
+        problem, U = discs("cpu", 5)
+        with block():
+            found.append(sampler.improved(problem, U, DrawKey(7, torch.arange(5), torch.arange(5))))
+    torch.testing.assert_close(*found, rtol=tolerance, atol=tolerance)
 
 
 def test_single_precision_works() -> None:

@@ -64,7 +64,7 @@ def test_the_bits_are_those_of_the_cpu(solver: str, whole: bool) -> None:
 
 def test_single_precision_is_solved_in_double() -> None:
     problem, U0 = problem_of("cpu", dtype=torch.float32)
-    expected = torchgco.solve(elsewhere._held_on_cpu(problem), U0.double(), "interior_point")
+    expected = torchgco.solve(elsewhere._copied(problem), U0.double(), "interior_point")
     with SecondDevice(), pytest.warns(DeviceWarning):
         solution = torchgco.solve(*problem_of(OTHER, dtype=torch.float32), "interior_point")
         assert solution.X.dtype == torch.float32 and solution.X.tolist() == expected.X.float().tolist()

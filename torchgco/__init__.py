@@ -38,6 +38,7 @@ from torchgco.base.version import VERSION
 from torchgco.baselines import Hold, IteratedMPPI
 from torchgco.compiled import MPC, Answer, Compiled, FleetMPC, MPPIController, compile
 from torchgco.constraints import (
+    BetweenKnots,
     Cone,
     Constraint,
     ControlBounds,
@@ -93,7 +94,7 @@ __all__ = [  # noqa: RUF022
     "QuadrotorPlanning", "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "Ellipsoids", "OscillatingBoxes", "Moved", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone",
-    "Gates", "Separation", "Link", "Integral", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "Gates", "Separation", "Link", "Integral", "BetweenKnots", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it

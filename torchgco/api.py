@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import partial
@@ -21,7 +22,7 @@ from torchgco.constraints.norms import within_norms
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.solve import solve_fleet
 from torchgco.guesses import Guess, guesses_of, solve_guesses
-from torchgco.kernels import copied_to, current, on_cpu, open_loop
+from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
@@ -122,8 +123,7 @@ def solve(
     check_untransformed("solve")
     if isinstance(problem, Fleet):
         others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing}
-        others |= {"guesses": guesses, **misplaced}
-        return _solve_fleet(problem, others, solver, seed, ids, max_seconds)
+        return _solve_fleet(problem, others | {"guesses": guesses, **misplaced}, solver, seed, ids, max_seconds)
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
@@ -132,13 +132,14 @@ def solve(
     solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
         problem, (U0, ids, warm, X0, tried) = there, copied_to((U0, ids, warm, X0, tried), there.x0)
-    problem, U0 = spared(problem, partial(_start, warm, solver, U0))
-    multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
-    watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-    found = _watched(watcher, solver, tried, (problem, U0, seed, ids, multipliers), max_seconds, X0)
-    warn_of(problem, found, warm is None)
-    problem, found = _returned(asked, problem, found, name)
-    return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+    with served_by(asked.x0.device):
+        problem, U0 = spared(problem, partial(_start, warm, solver, U0))
+        multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
+        watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
+        found = _watched(watcher, solver, tried, (problem, U0, seed, ids, multipliers), max_seconds, X0)
+        warn_of(problem, found, warm is None)
+        problem, found = _returned(asked, problem, found, name)
+        return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
 def _watched(
@@ -150,15 +151,13 @@ def _watched(
     X0: Tensor | None,
 ) -> Solution:
     """The solution of a call, from several guesses where there are some, under the eyes of the watcher."""
-    try:
+    with closing(watcher):
         if guesses is None:
             found = solver.solve(*call, watcher.callback, max_seconds, X0)
         else:
             found = solve_guesses(solver, guesses, *call[:4], watcher.callback, max_seconds)
         watcher.end(found)
         return found
-    finally:
-        watcher.close()
 
 
 def _returned(asked: Problem, problem: Problem, found: Solution, name: str | None) -> tuple[Problem, Solution]:

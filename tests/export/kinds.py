@@ -43,6 +43,10 @@ def car_rates(x: Tensor, u: Tensor) -> Tensor:
 
 CAR = FunctionDynamics(car_rates, n=4, m=2, dt=DT, integrator="rk4", position=slice(0, 2))
 START = [0.0, 0.0, 0.0, 3.0]
+# An actuator that follows within a tenth of a stage.
+LAGGING = FunctionDynamics(
+    lambda x, u: torch.stack((x[..., 1], x[..., 2], 100.0 * (u[..., 0] - x[..., 2])), -1), 3, 1, DT, "radau5"
+)
 BODY = Body([[0.0, 0.0], [0.5, 0.0]], [0.2, 0.2], lambda x: turned(x[..., 2]))
 
 
@@ -140,6 +144,9 @@ KINDS: dict[str, Callable[[], Problem]] = {
     "a map": mapped,
     "a network": learned,
     "values": valued,
+    "an implicit step": lambda: Problem(
+        LAGGING, QuadraticCost([1, 0, 0], [0.1], [10, 1, 0], [1, 0, 0]), [ControlBounds(-1.0, 1.0)], [0.0] * 3, N
+    ),
     "planar": lambda: Problem(
         Planar(dt=0.05), QuadraticCost([5, 5, 0, 1, 1, 0], [0.1, 0.1], [50, 50, 0, 1, 1, 0], [1, 0.4, 0, 0, 0, 0]),
         [Spheres([[0.2, 0.1]], [0.1], 0.06), ControlBounds(-10.0, 10.0)], [-1.0, 0, 0, 0, 0, 0], 20,

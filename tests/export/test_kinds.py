@@ -25,7 +25,7 @@ from torchgco import (
 )
 
 pytestmark = [needs_compiler, pytest.mark.usefixtures("quickly")]
-QUICK = "discs", "boxes", "a function", "values", "a required goal"
+QUICK = "discs", "an implicit step", "boxes", "a function", "values", "a required goal"
 # New numbers by name in Python, as shares of the old ones.
 CHANGED = {
     "discs": {"centers": 1.02, "radii": 0.9, "Q": 1.1, "constraints[0].upper": 0.95, "x_ref": 1.01, "u_ref": 1.0},

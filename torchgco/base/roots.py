@@ -14,6 +14,8 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.gradients import asks
 
 MOST_EVALUATIONS = 30  # 15 corrections from any guess that serves, and as many halvings
+# Of steps of this share of the unknowns, a power of the precision, rounding decides whether they serve: they end.
+BY_ROUNDING = 2.0 / 3.0
 SERVES_AGAIN = 0.1  # slopes serve for another correction where it is this share of the last one
 
 _LIBRARY = torch.library.Library("torchgco", "DEF")
@@ -106,7 +108,7 @@ def _newton(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
     monotonicity test, which no scale of the residual changes (Deuflhard, Newton Methods for Nonlinear Problems, section
     3.3). Slopes serve again where it is a tenth at most; the root is found where what is left is less than rounding.
     """
-    rest = residual(z).detach()
+    rest, epsilon = residual(z).detach(), torch.finfo(z.dtype).eps
     lost = ~torch.isfinite(rest).all(-1)
     done, share = lost, torch.ones_like(rest[..., 0])
     inverse = torch.linalg.inv_ex(_slopes(residual, z))[0]
@@ -117,12 +119,14 @@ def _newton(residual: Callable[[Tensor], Tensor], z: Tensor) -> Tensor:
         further, length = -_times(inverse, rest), step.abs().amax(-1)
         left, of_trial = further.abs().amax(-1), trial.abs().amax(-1)
         better = (left <= length) & ~done
-        ends = better & (left * left <= torch.finfo(z.dtype).eps * of_trial * length)
-        z = torch.where(better.unsqueeze(-1), trial + torch.where(ends.unsqueeze(-1), further, 0.0), z)
+        ends = better & (left * left <= epsilon * of_trial * length)
+        ends |= ~better & ~done & (length <= epsilon**BY_ROUNDING * of_trial)
+        ahead = trial + torch.where(ends.unsqueeze(-1), further, 0.0)
+        z = torch.where(better.unsqueeze(-1), ahead, z)
         share, done = torch.where(better, 1.0, 0.5 * share), done | ends
         if _all(done):
             break
-        stale = better & (left > SERVES_AGAIN * length)
+        stale = better & ~ends & (left > SERVES_AGAIN * length)
         if not _all(~stale):
             fresh = torch.linalg.inv_ex(_slopes(residual, z))[0]
             inverse = torch.where(stale[..., None, None], fresh, inverse)

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchgco.base.draws import DrawKey
-from torchgco.base.errors import InputError
 from torchgco.base.numbers import as_floats, measured
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
@@ -17,7 +16,7 @@ from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, wit
 from torchgco.compiled.numbers import Numbers
 from torchgco.compiled.stages import stage_of
 from torchgco.guidance.mppi import MPPI
-from torchgco.kernels import current, open_loop
+from torchgco.kernels import current, held_on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.alone import check_rows
 from torchgco.problem.problem import Problem, current_problem
@@ -35,7 +34,7 @@ class MPPIController:
     penalty; other constraints than the bounds of controls don't count, as in `MPPI`.
 
     Args:
-        problem: B vehicles on a CPU; its start isn't used.
+        problem: B vehicles; its start isn't used. Of a GPU, samples run there with the extra `cuda`, else on the CPU.
         sampler: options of a command's rounds.
         seed: of the noise; commands of one seed repeat themselves, each vehicle's as it would be alone.
         period: s, by which the plan moves on from command to command; None: a stage.
@@ -45,8 +44,8 @@ class MPPIController:
         U: the plan (B, N, m), of which the last command returned the first controls.
 
     Raises:
-        InputError: a problem on another device, with stages of several lengths or a free time; a covariance that
-            doesn't fit.
+        InputError: a problem with stages of several lengths or a free time; one of another device that can't be served
+            from the CPU; a covariance that doesn't fit.
     """
 
     def __init__(
@@ -54,8 +53,7 @@ class MPPIController:
     ) -> None:
         check_untransformed("MPPIController")
         problem = current_problem(problem)
-        if problem.x0.device.type != "cpu":
-            raise InputError("problem", "one on the CPU", str(problem.x0.device))
+        self._device, problem = problem.x0.device, held_on_cpu(problem)
         self.sampler = check_value(sampler or MPPI(), MPPI, "sampler")
         self.sampler.check(problem)
         self.seed, self.period = check_value(seed, Seed, "seed"), check_value(period, Seconds | None, "period")
@@ -98,7 +96,7 @@ class MPPIController:
         """
         state, B = measured(x, *self._problem.x0.shape), self._problem.B
         self.numbers.write(self.numbers.named(numbers, named, {"x0": state}))
-        with torch.no_grad(), torch.inference_mode(False), computing_on(CPU):
+        with torch.no_grad(), torch.inference_mode(False), computing_on(CPU), served_by(self._device):
             before = shifted(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))
             now = current(with_numbers_as_they_are(self._problem))
@@ -107,5 +105,5 @@ class MPPIController:
                 check_rows(now, open_loop(now, improved), improved)
             self.U = improved
         self._commands += 1
-        u = self.U[:, 0].clone()
+        u = self.U[:, 0].clone().to(self._device)
         return u[0] if state.ndim == 1 and B == 1 else u

@@ -27,7 +27,7 @@ from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, wit
 from torchgco.compiled.numbers import Numbers
 from torchgco.constraints.integral import Integral
 from torchgco.explaining.account import Account
-from torchgco.kernels import cost_scale, cost_unit, current, interior_of
+from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
@@ -74,7 +74,7 @@ def compile(
     which bounds are infinite stay as they are now: see `Compiled.stale`.
 
     Args:
-        problem: B problems, on a CPU.
+        problem: B problems. Those of a GPU are solved as by `torchgco.solve`; answers lie on the CPU.
         solver: "gco" or "interior_point": of the first call, and of what no warm start leads to.
         changes: names of the numbers that calls may change; others keep what the problem has. None: all that
             `Compiled.numbers` lists.
@@ -83,7 +83,8 @@ def compile(
         tolerance: of the optimality conditions; None: that of `InteriorPoint`.
 
     Raises:
-        InputError: another solver, a name that isn't there, a problem on another device, `receding` in free time.
+        InputError: another solver, a name that isn't there, a problem of another device that can't be served from the
+            CPU, `receding` in free time.
     """
     check_untransformed("compile")
     problem = current_problem(problem)
@@ -115,14 +116,13 @@ class Compiled:
     ) -> None:
         if problem.time is not None and receding:
             raise InputError("receding", "False where the time is free: calls say what has `elapsed`, s", True)
-        if problem.x0.device.type != "cpu":
-            raise InputError("problem", "one on the CPU", str(problem.x0.device))
         if any(isinstance(part, Integral) for part in problem.constraints):
             raise InputError("problem", "one without Integral in compiled problems and loops", "Integral")
+        self._device, there = problem.x0.device, held_on_cpu(problem)
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
         self._given: Problem | None = problem
         with _plainly():
-            self._begin(with_own_numbers(problem))
+            self._begin(with_own_numbers(there))
 
     def _begin(self, problem: Problem) -> None:
         all_numbers = numbers_of(problem)
@@ -141,7 +141,8 @@ class Compiled:
         """Compile and pack a problem as it is now; what was packed before hands its iterates on."""
         self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
         before, self._kept = self._kept, None
-        self._packed(problem)
+        with served_by(self._device):
+            self._packed(problem)
         if self._kept is not None and before is not None:
             self._kept.begin_with(before)
 
@@ -284,7 +285,7 @@ class Compiled:
     @_plainly()
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
-        names = "solver", "interior", "receding", "changes"
+        names = "solver", "interior", "receding", "changes", "_device"
         return {"problem": self.now} | {name: getattr(self, name) for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -419,7 +420,8 @@ class Compiled:
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - clock.seconds())
         warm = None if shift is None or self._last is None else later(now, self._last, shift)
-        return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
+        with served_by(self._device):
+            return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
         last, kept = self._found, self._kept

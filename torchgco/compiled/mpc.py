@@ -19,6 +19,7 @@ from torchgco.compiled.answer import Answer
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled, compile
 from torchgco.compiled.numbers import Numbers
 from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of
+from torchgco.kernels import held_on_cpu
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, held
 from torchgco.receding.plan import Plan, stages_between
@@ -43,7 +44,8 @@ class MPC:
     means over the next period, and of stages that are longer those of the first.
 
     Args:
-        problem: B vehicles with stages of one length, or a free time; its start isn't used.
+        problem: B vehicles with stages of one length, or a free time; its start isn't used. Of a GPU it is solved as by
+            `torchgco.solve`; plans lie on the CPU.
         solver: "gco" or "interior_point": of the first period, and of those that no plan before leads to, where an
             obstacle has come into the way, say. None: "gco" among obstacles, as only it searches for other ways, else
             "interior_point".
@@ -74,7 +76,8 @@ class MPC:
         changes: Sequence[str] | None = None,
         tolerance: float | None = None,
     ) -> None:
-        problem = current_problem(problem)
+        asked = current_problem(problem)
+        problem = held_on_cpu(asked)
         for name, value in (("horizon", problem.horizon), ("free_start", problem.free_start)):
             if value is not None:
                 raise InputError(f"problem.{name}", "None in a loop, which starts from measured states", "one")
@@ -88,7 +91,7 @@ class MPC:
             solver = "gco" if problem.obstacles else "interior_point"
         self._previous = [f"constraints[{i}].previous" for i, c in enumerate(problem.constraints) if follows(c)]
         changes = None if changes is None else ["x0", *self._previous, *changes]
-        self.compiled: Compiled = compile(problem, solver, changes, tolerance=tolerance)
+        self.compiled: Compiled = compile(asked, solver, changes, tolerance=tolerance)
         self._problem, self._limit = problem, self.max_seconds
         if self._limit is None and period is not None:
             self._limit = self.period

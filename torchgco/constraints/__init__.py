@@ -7,6 +7,7 @@ is the interface of what keeps bodies apart. It imports `base`, `costs` and `dyn
 
 from torchgco.constraints.base import Constraint as Constraint
 from torchgco.constraints.base import FunctionConstraint as FunctionConstraint
+from torchgco.constraints.between_knots import BetweenKnots as BetweenKnots
 from torchgco.constraints.bounds import ControlBounds as ControlBounds
 from torchgco.constraints.bounds import RateBounds as RateBounds
 from torchgco.constraints.bounds import StateBounds as StateBounds

@@ -17,7 +17,8 @@ from torchgco.constraints.bounds import LOOSE
 from torchgco.export.numbers import ABOVE_ZERO, AT_LEAST_ZERO, BOUND, Changing, Copies, fixed_radii
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
-from torchgco.native.declarations import Structure, defines
+from torchgco.native.declarations import Structure, defines, kept_by
+from torchgco.native.includes import C
 from torchgco.native.kept import Kept
 from torchgco.native.packing import kind_of
 from torchgco.receding.plan import STAGE_ROUNDING
@@ -31,8 +32,10 @@ TYPES = {
 }  # fmt: skip
 # Files of the kernels, and what takes their places.
 REPLACED = {
-    "vectors.h": "scalar.h", "wide.h": "wide_scalar.h", "allocation.h": "arena.h", "clock.h": "seconds.h",
+    "vectors.h": C / "scalar" / "vectors.h", "wide.h": C / "scalar" / "wide.h",
+    "allocation.h": HERE / "arena.h", "clock.h": HERE / "seconds.h",
 }  # fmt: skip
+FILES = "riccati.c", "interior.c", "sweep.h", "rollout.h"  # the interior point, sweeps and rollouts
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
 SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
 
@@ -95,21 +98,6 @@ def table(declared: str, values: Tensor | Iterable[float]) -> str:
     return "\n".join([f"{declared} = {{", *lines, line, "};"])
 
 
-def kept_by(structure: Structure) -> dict[int, Tensor]:
-    """All tensors that a structure and those in it point to, by address."""
-    todo: list[Any] = list(structure.kept)
-    found = dict[int, Tensor]()
-    while todo:
-        one = todo.pop()
-        if isinstance(one, Tensor):
-            found.setdefault(one.data_ptr(), one)
-        elif isinstance(one, list):
-            todo += one
-        elif isinstance(one, Structure):
-            todo += one.kept
-    return found
-
-
 @dataclass(frozen=True)
 class Solver:
     """The C of a problem's solver.
@@ -146,10 +134,10 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
         rows, fields, writer.body(how, of="&b->problem"), changing, made, _rest(kept, changing, writer, rest)
     )
     count = _count(kept)
-    need = count + 2 + (K + 1) * (POINTERS_OF_ROWS + 2)
+    need = count + (K + 1) * (POINTERS_OF_ROWS + 2)
     sizes = problem.N + 1, problem.N, problem.n, problem.m
     room = need + _solve_size(K, sizes, [len(kept_by(how)[address].flatten()) for address in changing.copied])
-    texts = {name: (HERE / own).read_text() for name, own in REPLACED.items()}
+    texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
     own = [
@@ -158,7 +146,8 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
         _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
     ]  # fmt: skip
     flash = writer.flash + 8 * sum(m.size for m in changing.members) + sum(part.flash for part in made)
-    return Solver(kept.engine.form.alone(_kinds(kept), declared, texts), "\n".join(own), room, multipliers, flash)
+    solver = kept.engine.form.alone(FILES, texts, declared, KINDS=sum(1 << kind for kind in _kinds(kept)))
+    return Solver(solver, "\n".join(own), room, multipliers, flash)
 
 
 def _constraints(kept: Kept) -> list[c.Constraint]:
@@ -332,7 +321,7 @@ def _structure(K: int, made: list[str]) -> str:
 
 
 def _assertion(count: int, K: int) -> str:
-    need = f"{count + 2} * sizeof(double) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t))"
+    need = f"{count} * sizeof(double) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t))"
     return f"typedef char NAME_has_room[sizeof(Solve) + {need} <= sizeof(((NAME_workspace *)0)->room) ? 1 : -1];"
 
 

@@ -2,8 +2,8 @@
 
 Solvers call the functions of `verbs`, which ask `choice.kernels_of` whose they are. `in_c` hands a problem to
 `native`; where its code can't be traced, a warning names it, and `in_pytorch` computes the same. `elsewhere` brings
-problems of a GPU to the CPU. It imports `native`
-and `eager`. Begin with `in_pytorch.py`, which says what kernels are asked.
+problems of a GPU to the CPU, and has their loops run on the GPU. It imports `native` and `eager`. Begin with
+`in_pytorch.py`, which says what kernels are asked.
 """
 
 from torchgco.kernels.choice import EagerWarning as EagerWarning
@@ -14,7 +14,9 @@ from torchgco.kernels.choice import native as native
 from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
 from torchgco.kernels.elsewhere import copied_to as copied_to
+from torchgco.kernels.elsewhere import held_on_cpu as held_on_cpu
 from torchgco.kernels.elsewhere import on_cpu as on_cpu
+from torchgco.kernels.elsewhere import served_by as served_by
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
 from torchgco.kernels.verbs import cost_unit as cost_unit

@@ -1,4 +1,4 @@
-"""Problems of a GPU that C solves on the CPU, by copies.
+"""Problems of a GPU, by copies: C serves them on the CPU, but for what iterates on many, which runs on their device.
 
 PyTorch's kernels start hundreds of small operations for each stage: on a GPU a solve takes some hundred times as long
 as in C on one core.
@@ -7,15 +7,20 @@ as in C on one core.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import cache, partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import DeviceWarning
+from torchgco.base.errors import DeviceWarning, InputError
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import field_names, mapped
 from torchgco.kernels.choice import native, serves
+from torchgco.native.cuda.compiler import Loaded, available
+from torchgco.native.cuda.engine import OnDevice, working_on
 from torchgco.problem.problem import Problem
 
 
@@ -28,19 +33,45 @@ def on_cpu(problem: Problem) -> Problem | None:
     device = problem.x0.device
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
-    there = _held_on_cpu(problem)
-    with computing_on(CPU):
+    there = _copied(problem)
+    with computing_on(CPU), served_by(device):
         if not serves(there):
             return None
     global _said
-    if not _said:
+    if not _said and on_device(device) is None:
         _said = True
         told = f"problems on {device} are solved by C on the CPU, with copies: PyTorch's kernels take far longer there"
         warnings.warn(told, DeviceWarning, stacklevel=4)
     return there
 
 
-def _held_on_cpu(problem: Problem) -> Problem:
+def held_on_cpu(problem: Problem) -> Problem:
+    """The problem on the CPU: itself, or as `on_cpu` has it.
+
+    Raises:
+        InputError: C doesn't serve it there.
+    """
+    there = problem if problem.x0.device.type == CPU.type else on_cpu(problem)
+    if there is None:
+        raise InputError("problem", "one on the CPU", str(problem.x0.device))
+    return there
+
+
+@cache
+def on_device(device: torch.device) -> OnDevice | None:
+    """The kernels of a device; None where it has none, or the extra `cuda` isn't installed."""
+    return OnDevice(partial(Loaded, device=device)) if device.type == "cuda" and available() else None
+
+
+@contextmanager
+def served_by(device: torch.device) -> Iterator[None]:
+    """In this block what iterates on many problems runs on a device, if that has kernels."""
+    kernels = on_device(device) if native() else None
+    with nullcontext() if kernels is None else working_on(kernels):
+        yield
+
+
+def _copied(problem: Problem) -> Problem:
     """The problem without gradients; what users' functions hold stays where it is."""
     change = lambda leaf: leaf.detach().to(CPU, torch.float64 if leaf.is_floating_point() else leaf.dtype)
     parts = {name: mapped(getattr(problem, name), change) for name in field_names(type(problem))}

@@ -12,6 +12,7 @@ from torchgco.ilqr import lifted
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
 from torchgco.lagrangian.state import PassEnd, State
+from torchgco.native.cuda.engine import Kernel
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import End, Options, Outer
 from torchgco.problem.problem import Problem
@@ -71,7 +72,12 @@ class NativeOuter:
         self._run(passes=passes, solves=1, updates=1)
 
     def run_half(self, at_once: int) -> None:
-        """Passes until half of the problems have an outcome, or all if lanes suffice; at most `at_once` in a call."""
+        """Passes until half of the problems have an outcome, or all if lanes suffice; at most `at_once` in a call, and
+        all in one of a device.
+        """
+        function = self.engine.library.tgco_outer
+        if isinstance(function, Kernel) and function.pays(self.b):
+            at_once = self.b * self.outer.max_outer
         while True:
             running = int((self.outcome.numpy() == Status.RUNNING).sum())
             if running == 0 or (self.b > self.engine.lanes and 2 * running <= self.b):

@@ -22,7 +22,7 @@ TENSOR_TYPES = {
 PLAIN = (int, float, type(None))  # values that a field has as they are: numbers, and no address
 _set = ctypes.Structure.__setattr__
 _COMMENT, _STRUCTURE = re.compile(r"/\*.*?\*/", re.DOTALL), re.compile(r"typedef struct \{(.*?)\} (\w+);", re.DOTALL)
-_DECLARATION, _NAMED = re.compile(r"(?:const )?(\w+) ([^;]+);"), re.compile(r"(\*?)(\w+)(?:\[(\w+)\])?")
+_DECLARATION, _NAMED = re.compile(r"(const )?(\w+) ([^;]+);"), re.compile(r"(\*?)(\w+)(?:\[(\w+)\])?")
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class Field:
     kind: str
     pointer: bool
     count: str = ""
+    const: bool = False  # C doesn't write to what it points to
 
 
 class Structure(ctypes.Structure):
@@ -101,6 +102,22 @@ class Structure(ctypes.Structure):
         return value.data_ptr()
 
 
+def kept_by(structure: Structure) -> dict[int, Any]:
+    """All tensors, structures and arrays of these that a structure and those in it point to, by address."""
+    todo: list[Any] = [structure]
+    found = dict[int, Any]()
+    while todo:
+        one = todo.pop()
+        if isinstance(one, list):
+            todo += one
+        elif isinstance(one, Tensor):
+            found.setdefault(one.data_ptr(), one)
+        elif isinstance(one, (ctypes.Structure, ctypes.Array)):
+            known = found.setdefault(ctypes.addressof(one), one)
+            todo += one.kept if known is one and isinstance(one, Structure) else []
+    return found
+
+
 class Header:
     """The structures of a header of C, typedef struct { ... } NAME; of numbers, pointers, structures, arrays of these.
 
@@ -140,9 +157,9 @@ class Header:
 
 def _fields(body: str) -> dict[str, Field]:
     fields = dict[str, Field]()
-    for kind, names in _DECLARATION.findall(body):
+    for const, kind, names in _DECLARATION.findall(body):
         for pointer, name, count in _NAMED.findall(names):
-            fields[name] = Field(kind, pointer == "*", count)
+            fields[name] = Field(kind, pointer == "*", count, bool(const))
     return fields
 
 

@@ -25,6 +25,8 @@ from torchgco.native.codegen.cost import cost_arrays, trace_cost
 from torchgco.native.codegen.source import Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit, build
+from torchgco.native.cuda.engine import Kernel, Library, current_device
+from torchgco.native.cuda.source import SOLVER
 from torchgco.native.packing import (
     constraint_of,
     guide_of,
@@ -80,23 +82,31 @@ class Engine:
         self.shared = first
         lifted = frozenset(i for i in self.functions if is_lifted(parts[i]))
         self.form = Form(self.model, position, self.cost, dense, functions, lifted)
-        self._libraries: dict[Hashable, ctypes.CDLL] = {}
+        self._libraries: dict[Hashable, Any] = {}
         if compiles:
             self.serve(problem.B, ahead)
 
     def serve(self, B: int, ahead: Callable[[Engine], None] | None = None) -> None:
         """Have the library that suits solves of B problems, all in all; `ahead` is called before it is compiled."""
         self.B, self.lanes = B, lanes_for(B, LANES_OF_ONE)
-        if ahead is not None and self.lanes not in self._libraries:
+        if ahead is not None and (None, self.lanes) not in self._libraries:
             ahead(self)
-        self.library = self.further(self.lanes, lambda: self.form.units(lanes=self.lanes))
+        self.library = self.further(self.lanes, lambda: self.form.units(lanes=self.lanes), SOLVER)
 
-    def further(self, name: Hashable, units: Callable[[], Sequence[Unit]]) -> ctypes.CDLL:
-        """A further library of this form, which this engine and those with other shared numbers keep."""
-        if name not in self._libraries:
+    def further(self, name: Hashable, units: Callable[[], Sequence[Unit]], *of_device: Any) -> Any:
+        """A further library of this form, which this engine and those with other shared numbers keep.
+
+        Args:
+            of_device: a `Program`, and the type of its numbers, for a library of a device.
+        """
+        device = current_device()
+        key = device, name
+        if key not in self._libraries:
             with setting_up():
-                self._libraries[name] = build(units())
-        return self._libraries[name]
+                host = self._libraries.get((None, name)) or build(units())
+                self._libraries[None, name] = host
+                self._libraries[key] = host if device is None else Library(device, self.form, host, *of_device)
+        return self._libraries[key]
 
     def forget_values(self) -> None:
         """Let go of the numbers of the problem that the functions were traced with: all are solved with their own."""
@@ -253,6 +263,10 @@ def run(function: Any, count: int, group: int, argument: ctypes.Structure, first
     """
     if count == 0:
         return
+    if isinstance(function, Kernel):
+        if function.served(argument, first, count):
+            return
+        function = function.host
     groups, threads = -(-count // group), torch.get_num_threads()
     if groups == 1 or threads == 1:
         if not function(ctypes.byref(argument), ctypes.c_int64(first), ctypes.c_int64(first + count)):

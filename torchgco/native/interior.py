@@ -17,6 +17,7 @@ from torchgco.lagrangian.kkt import CLOSING_ROUNDS, LEAST_PIVOT, SLIGHT, STIFF, 
 from torchgco.native import structures
 from torchgco.native.codegen.source import INTERIOR, lanes_for
 from torchgco.native.compiler import begin
+from torchgco.native.cuda import source as cuda
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import Interior, Kkt
 from torchgco.problem.problem import Problem
@@ -117,7 +118,7 @@ class InteriorEngine(InteriorKernels):
     def __init__(self, engine: Engine) -> None:
         self.engine, self.lanes = engine, lanes_for(engine.B)
         units = partial(engine.form.units, INTERIOR, lanes=self.lanes)
-        self.library = engine.further(("interior", self.lanes), units)
+        self.library = engine.further(("interior", self.lanes), units, cuda.INTERIOR)
 
     def _rows(self, problem: Problem) -> list[structures.Constraint]:
         return self.engine.rows(problem)

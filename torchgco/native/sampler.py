@@ -10,6 +10,7 @@ from torchgco.base.shapes import repeated
 from torchgco.eager.sampling import Sampling
 from torchgco.native import structures
 from torchgco.native.codegen.source import LANES, SAMPLER
+from torchgco.native.cuda import source as cuda
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import array
 from torchgco.problem.problem import Problem
@@ -26,7 +27,9 @@ class Sampler:
 
     def __init__(self, engine: Engine, dtype: torch.dtype) -> None:
         self.engine = engine
-        self.library = engine.further(dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]))
+        self.library = engine.further(
+            dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]), cuda.SAMPLER, REALS[dtype][0]
+        )
 
     def improve(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         """See `kernels.in_pytorch.Kernels.sample`."""

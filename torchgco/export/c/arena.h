@@ -17,5 +17,7 @@ static void *take(const Problem *p, size_t bytes) {
     return memory;
 }
 
+static Numbers take_numbers(const Problem *p, int64_t count) { return (Numbers)take(p, (size_t)count * sizeof(V)); }
+
 /* All of it is taken anew for the next solve. */
 static void give(const Problem *p, void *memory) { (void)p; (void)memory; }

@@ -7,13 +7,13 @@
 typedef struct { Constraint con; Rows rows; V x[POSITION + DIM]; } Ball;
 
 /* The centers of all balls at knot k. */
-static inline void ball_centers(const Lanes *s, int64_t i, int64_t k, const V *x, V *centers) {
+static inline void ball_centers(const Lanes *s, int64_t i, int64_t k, IN x, OUT centers) {
     const Constraint *con = s->of->constraint + i;
-    model_rows((int)i, x, 0, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, centers);
+    model_rows((int)i, x, NONE, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, centers);
 }
 
 /* Ball b of `con` at knot k, with v (DIM) in the place of its position: its center, or how that changes. */
-static inline void ball_at(const Constraint *con, const Rows *rows, int b, int64_t k, const V *v, Ball *ball) {
+static inline void ball_at(const Constraint *con, const Rows *rows, int b, int64_t k, IN v, Ball *ball) {
     int64_t each = con->rows / con->balls;
     ball->con = *con; ball->rows = *rows;
     ball->con.rows = (int32_t)each; ball->con.kind = con->kind_of_balls;
@@ -25,7 +25,7 @@ static inline void ball_at(const Constraint *con, const Rows *rows, int b, int64
 }
 
 /* Whether a ball adds nothing, in any lane, with gradient g and upper triangle H (DIM, S) by its position. */
-static inline int adds_nothing(const V *g, const V *H) {
+static inline int adds_nothing(IN g, IN H) {
     I adds = SET(0.0) != SET(0.0);
     for (int a = 0; a < DIM; a++) {
         adds |= g[a] != SET(0.0);
@@ -35,7 +35,7 @@ static inline int adds_nothing(const V *g, const V *H) {
 }
 
 /* Adds e' h e to H (S, S), with h (DIM, S) the upper triangle by a ball's position, and its slopes e (DIM, count). */
-static inline void pull_square(int count, const int *columns, const V *e, const V *h, V *H) {
+static inline void pull_square(int count, const int *columns, IN e, IN h, OUT H) {
     for (int p = 0; p < count; p++) {
         V along[DIM];
         for (int b = 0; b < DIM; b++) {
@@ -49,7 +49,7 @@ static inline void pull_square(int count, const int *columns, const V *e, const 
 }
 
 /* Adds e' g to the gradient by z. */
-static inline void pull_slope(int count, const int *columns, const V *e, const V *g, V *by) {
+static inline void pull_slope(int count, const int *columns, IN e, IN g, OUT by) {
     for (int p = 0; p < count; p++)
         for (int a = 0; a < DIM; a++) ADD(by[columns[p]], e[a * count + p], g[a]);
 }

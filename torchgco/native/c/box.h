@@ -11,8 +11,8 @@
 #define BOX_RADIUS(box) ((box)[BOX_NUMBERS - 1])
 
 /* Coordinates of a vector along the sides. */
-static inline void along_sides(const V *box, const V *v, V *local) {
-    const V *axes = box + DIM;
+static inline void along_sides(IN box, IN v, OUT local) {
+    IN axes = box + DIM;
     for (int i = 0; i < DIM; i++) {
         local[i] = SET(0.0);
         for (int j = 0; j < DIM; j++) local[i] += axes[i * DIM + j] * v[j];
@@ -20,7 +20,7 @@ static inline void along_sides(const V *box, const V *v, V *local) {
 }
 
 /* Coordinates of a point along the sides, from the centre. */
-static inline void seen_from(const V *box, const V *p, V *local) {
+static inline void seen_from(IN box, IN p, OUT local) {
     V away[DIM];
     for (int i = 0; i < DIM; i++) away[i] = p[i] - box[i];
     along_sides(box, away, local);

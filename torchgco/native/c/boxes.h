@@ -16,9 +16,9 @@ static inline I is_here(const Constraint *con, const Rows *rows, V radius, int64
 }
 
 /* Row j at knot k, and its derivatives by position (DIM) unless `slopes` is NULL; an absent box is c = -1. */
-static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *slopes) {
-    const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
-    const V *axes = box + DIM, *half = BOX_HALF(box), radius = BOX_RADIUS(box);
+static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_t k, IN x, OUT slopes) {
+    IN factors = rows->bound + con->rows * 2 * DIM; IN box = factors + con->rows + j * BOX_NUMBERS;
+    IN axes = box + DIM; IN half = BOX_HALF(box); const V radius = BOX_RADIUS(box);
     V factor = factors[j], zero = SET(0.0), local[DIM], away[DIM], square = zero, deepest = zero;
     I nearest[DIM];
     seen_from(box, x + POSITION, local);
@@ -46,10 +46,10 @@ static inline V solid(const Constraint *con, const Rows *rows, int64_t j, int64_
 }
 
 /* The lanes in which the knot lies within the bounds of box j. */
-static inline I is_near(const Constraint *con, const Rows *rows, int64_t j, const V *x) {
+static inline I is_near(const Constraint *con, const Rows *rows, int64_t j, IN x) {
     I far = SET(0.0) != SET(0.0);
     for (int a = 0; a < DIM; a++) {
-        const V *bounds = rows->bound + (a * con->rows + j) * 2;
+        IN bounds = rows->bound + (a * con->rows + j) * 2;
         far |= tgco_fabs(x[POSITION + a] - bounds[0]) > bounds[1];
     }
     return NOT(far);
@@ -58,7 +58,7 @@ static inline I is_near(const Constraint *con, const Rows *rows, int64_t j, cons
 /* Whether one of the boxes first, ..., last - 1 may add anything in a lane: the knot is near it, or it has a multiplier
    where some are `pushed`. Most groups of boxes are answered by one test. */
 static inline int some_matter(
-    const Constraint *con, const Rows *rows, const V *lam, int pushed, int64_t first, int64_t last, const V *x) {
+    const Constraint *con, const Rows *rows, IN lam, int pushed, int64_t first, int64_t last, IN x) {
     I matters = SET(0.0) != SET(0.0);
     for (int64_t j = first; j < last; j++) {
         matters |= is_near(con, rows, j, x);
@@ -68,20 +68,20 @@ static inline int some_matter(
 }
 
 /* The same of one box. */
-static inline int may_matter(const Constraint *con, const Rows *rows, const V *lam, int pushed, int64_t j, const V *x) {
+static inline int may_matter(const Constraint *con, const Rows *rows, IN lam, int pushed, int64_t j, IN x) {
     return some_matter(con, rows, lam, pushed, j, j + 1, x);
 }
 
 TGCO_APART V boxes_terms(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
-    const V *lam = rows->lam + con->place[k] * con->rows;
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, IN x, V total, OUT g, OUT H) {
+    IN lam = rows->lam + con->place[k] * con->rows;
     int pushed = any(rows->pushed[con->place[k]]);
     for (int64_t first = 0, last; first < con->rows; first = last) {
         last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
         if (!some_matter(con, rows, lam, pushed, first, last, x)) continue;
         for (int64_t j = first; j < last; j++) {
             if (!may_matter(con, rows, lam, pushed, j, x)) continue;
-            V slopes[DIM], c = solid(con, rows, j, k, x, g ? slopes : 0);
+            V slopes[DIM], c = solid(con, rows, j, k, x, g ? slopes : NULL);
             if (!any(NOT(c <= SET(0.0)) | (lam[j] != SET(0.0)))) continue;
             if (g) add_slopes(s, c, lam[j], slopes, g, H);
             else total += worth(s, 0, c, lam[j]);

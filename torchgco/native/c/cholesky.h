@@ -3,7 +3,7 @@
 #include "model.h"
 
 /* L of L L' = H_uu, of whose upper triangle in H (S, S) is read; L's diagonal is inverted. Pivots go into `pivots`. */
-static inline void factor_controls(const V *H, V *L, V *pivots) {
+static inline void factor_controls(IN H, OUT L, OUT pivots) {
     for (int j = 0; j < NU; j++) {
         V pivot = H[(NX + j) * S + NX + j];
         for (int i = 0; i < j; i++) SUBTRACT(pivot, L[j * NU + i], L[j * NU + i]);
@@ -19,18 +19,18 @@ static inline void factor_controls(const V *H, V *L, V *pivots) {
 }
 
 /* Y = L^-1 Y for `count` columns of Y (NU, width). */
-static inline void solve_lower(const V *L, V *Y, int width, int count) {
+static inline void solve_lower(IN L, OUT Y, int width, int count) {
     for (int j = 0; j < NU; j++) {
-        V *row = Y + j * width;
+        OUT row = Y + j * width;
         for (int a = 0; a < j; a++) for (int i = 0; i < count; i++) SUBTRACT(row[i], L[j * NU + a], Y[a * width + i]);
         for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
     }
 }
 
 /* Y = L'^-1 Y for `count` columns of Y (NU, width). */
-static inline void solve_upper(const V *L, V *Y, int width, int count) {
+static inline void solve_upper(IN L, OUT Y, int width, int count) {
     for (int j = NU - 1; j >= 0; j--) {
-        V *row = Y + j * width;
+        OUT row = Y + j * width;
         for (int a = j + 1; a < NU; a++)
             for (int i = 0; i < count; i++) SUBTRACT(row[i], L[a * NU + j], Y[a * width + i]);
         for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];

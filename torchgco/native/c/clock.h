@@ -9,3 +9,4 @@ static double tgco_now(void) {
     return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 #define SECONDS_NOW(how) tgco_now()
+#define SECONDS_BEGUN(how) tgco_now() /* when a function begins */

@@ -21,7 +21,7 @@ static inline V within_lattice(V place, int64_t size) {
     return tgco_choose(low < last, low, last);
 }
 
-static inline V lattice_place(const Rows *rows, const V *x, int axis) {
+static inline V lattice_place(const Rows *rows, IN x, int axis) {
     return (x[POSITION + axis] - rows->bound[axis]) * rows->bound[INVERSE];
 }
 
@@ -29,7 +29,7 @@ static inline int64_t lattice_size(const Constraint *con, int axis) {
     return axis == 0 ? con->map_x : axis == 1 ? con->map_y : con->map_z;
 }
 
-static inline Axis axis_at(const Constraint *con, const Rows *rows, const V *x, int axis) {
+static inline Axis axis_at(const Constraint *con, const Rows *rows, IN x, int axis) {
     V u = lattice_place(rows, x, axis), one = SET(1.0), zero = SET(0.0), half = SET(0.5), two = SET(2.0);
     V base = tgco_floor(con->smooth ? u + half : u), f = u - base;
     Axis t;
@@ -120,9 +120,10 @@ static inline I map_counts(const Constraint *con, const Rows *rows, int64_t k) {
 /* The row at knot k, with its derivatives by position, (DIM) and (DIM, DIM), where they aren't NULL; -1 where the map
    doesn't count. */
 TGCO_APART V field_row(
-    const Constraint *con, const Rows *rows, int64_t k, const V *x, V *slopes, V *curvature) {
+    const Constraint *con, const Rows *rows, int64_t k, IN x, OUT slopes, OUT curvature) {
     Axis axes[DIM];
-    const V *at[DIM], *number = rows->bound;
+    const V *at[DIM];
+    IN number = rows->bound;
     for (int a = 0; a < DIM; a++) axes[a] = axis_at(con, rows, x, a);
     Sums sums = sum_of_all(con, rows, axes, at, curvature ? 2 : slopes ? 1 : 0);
     V factor = number[SLOPE_SCALE], inverse = number[INVERSE], square = number[STEP_SQUARE];
@@ -141,7 +142,7 @@ TGCO_APART V field_row(
 }
 
 /* Whether no lane is in contact: as the distance at the nearest node shows, which is all that is read. */
-static inline int is_far_from_map(const Constraint *con, const Rows *rows, const V *x) {
+static inline int is_far_from_map(const Constraint *con, const Rows *rows, IN x) {
     V place[DIM];
     const V *at[DIM];
     for (int a = 0; a < DIM; a++) {
@@ -161,15 +162,15 @@ static inline V length_of(V square, V core) {
 
 /* How deep beneath the full surface a row c > 0 is, m. */
 static inline V depth_of(const Rows *rows, V c) {
-    const V *number = rows->bound;
+    IN number = rows->bound;
     return number[LIMIT] - length_of(number[RADIUS_SQUARE] - c / number[SLOPE_SCALE], number[CORE]);
 }
 
 TGCO_APART V field_terms(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, IN x, V total, OUT g, OUT H) {
     V lam = rows->lam[con->place[k]], slopes[DIM];
     if (!any(lam != SET(0.0)) && is_far_from_map(con, rows, x)) return total;
-    V c = field_row(con, rows, k, x, g ? slopes : 0, 0);
+    V c = field_row(con, rows, k, x, g ? slopes : NULL, NONE);
     if (!g) return total + worth(s, 0, c, lam);
     add_slopes(s, c, lam, slopes, g, H);
     return total;

@@ -5,9 +5,9 @@
 #include "memory.h"
 #include "passes.h"
 
-/* The numbers first, ..., last - 1 of problems, to be freed; NULL without memory. */
-static int64_t *in_order(int64_t first, int64_t last) {
-    int64_t *number = malloc((last - first + 1) * sizeof *number);
+/* The numbers first, ..., last - 1 of problems, to be given back; NULL without memory. */
+static int64_t *in_order(const Problem *p, int64_t first, int64_t last) {
+    int64_t *number = (int64_t *)take(p, (last - first + 1) * sizeof *number);
     for (int64_t i = 0; number && first + i < last; i++) number[i] = first + i;
     return number;
 }
@@ -27,7 +27,7 @@ static void commit(Lanes *s, I won, const int *from, V alpha, V cost, V merit) {
 }
 
 /* The line search (lines 14-24) of the lanes `moving`. The `replicas` lanes of a problem try rungs in parallel. */
-static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
+TGCO_LARGE I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
     const Options *o = &s->of->options;
     int replicas = s->of->replicas;
     int64_t landed[LANES];
@@ -43,7 +43,7 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
             LANE(alpha, l) = o->ladder[last ? o->rungs - 1 : rung];
             LANE(enough, l) = !LANE(open, l) ? -INFINITY : last || !s->of->bounded ? INFINITY : LANE(most, l);
         }
-        roll(s, knot_value, alpha, enough, &cost, &merit);
+        roll(s, CALLED(knot_value), alpha, enough, &cost, &merit);
         V ratio = (merit - s->merit) / (alpha * linear + SET(0.5) * alpha * alpha * quadratic);
         I good = (ratio >= SET(o->ratio_min)) & (ratio <= SET(o->ratio_max));
         if (o->accept_last) good |= alpha < SET(o->smallest);
@@ -76,12 +76,12 @@ static I search(Lanes *s, I moving, V linear, V quadratic, V *shortest) {
 }
 
 /* One iteration. Returns the lanes that are done, their status, and whether they converged, were refused or diverge. */
-static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused, I *lost) {
+TGCO_LARGE I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused, I *lost) {
     const Options *o = &s->of->options;
     V linear, squares, lowest, zero = SET(0.0), old = s->merit, shortest;
     s->alpha = zero;
     s->used = s->mu_r;
-    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
+    backward(s, CALLED(knot_expand), NONE, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares, before = s->mu_r;
     I failed = NOT(lowest > zero) & running;
     V expected = tgco_fabs(linear + SET(0.5) * quadratic);
@@ -92,7 +92,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
         V higher = s->mu_r * SET(o->regularisation_growth);
         higher = tgco_choose(higher < SET(o->regularisation_first), SET(o->regularisation_first), higher);
         s->mu_r = tgco_choose(failed, higher, s->mu_r);
-        I sound = is_finite(s, knot_expand);
+        I sound = is_finite(s, CALLED(knot_expand));
         for (int l = 0; l < LANES; l++) if (LANE(failed, l)) {
             if (LANE(s->mu_r, l) > o->regularisation_max) status[l] = NOT_POSITIVE_DEFINITE;
             if (!LANE(sound, l)) status[l] = NON_FINITE;
@@ -128,7 +128,7 @@ static I iterate(Lanes *s, I running, int32_t *status, I *converged, I *refused,
 }
 
 /* Up to `limit` iterations of the inner solves of `count` problems, by their numbers. */
-static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
+TGCO_LARGE void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
     int replicas = s->of->replicas;
     I running = SET(0.0) != SET(0.0);
     int64_t next = 0;
@@ -146,8 +146,8 @@ static void inner_solves(Lanes *s, const int64_t *number, int64_t count) {
         I converged, refused, lost, ended;
         ended = iterate(s, running, status, &converged, &refused, &lost);
         for (int e = 0; e < LANES; e += replicas) {
-            if (!ended[e]) continue;
-            leave(s, e, status[e], converged[e] != 0, refused[e] != 0, lost[e] != 0);
+            if (!LANE(ended, e)) continue;
+            leave(s, e, status[e], LANE(converged, e) != 0, LANE(refused, e) != 0, LANE(lost, e) != 0);
             for (int l = e; l < e + replicas; l++) {
                 if (next < count) enter(s, l, number[next]);
                 else LANE(running, l) = 0;

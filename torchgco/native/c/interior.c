@@ -6,7 +6,7 @@
 #include "interior_search.h"
 
 /* Values and an empty filter of the lanes `of`; `anew`: slacks, too, and which rows have one. */
-static void settle(Barrier *t, Track *k, I of, int anew) {
+TGCO_LARGE void settle(Barrier *t, Track *k, I of, int anew) {
     const Interior *how = t->how;
     Lanes *s = &t->lanes;
     V cost = values(t, t->live, s->X, s->U, t->c, t->gap);
@@ -29,7 +29,7 @@ static void settle(Barrier *t, Track *k, I of, int anew) {
 }
 
 /* Sizes of bounds join those of their variables. */
-static void measure_bounds(const Barrier *t, V *size) {
+static void measure_bounds(const Barrier *t, OUT size) {
     const Lanes *s = &t->lanes;
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;
@@ -43,7 +43,7 @@ static void measure_bounds(const Barrier *t, V *size) {
 }
 
 /* Sizes that no number tells, 0, follow from those of the states that these variables move within a step. */
-static void infer_sizes(const Barrier *t, V *size) {
+static void infer_sizes(const Barrier *t, OUT size) {
     const Lanes *s = &t->lanes;
     I open = SET(0.0) != SET(0.0);
     for (int v = 0; v < S; v++) open |= size[v] == SET(0.0);
@@ -68,12 +68,12 @@ static void infer_sizes(const Barrier *t, V *size) {
    In a variable of small units, a length in tens of kilometres, curvatures are large though it moves little: the scaled
    cost would be tiny beside barrier and multipliers. So a variable whose numbers are all small counts in units of the
    largest of them: in the guess, in its bounds, and in the step to the minimum of the cost alone. */
-static V steepest(const Barrier *t, V *plain) {
+TGCO_LARGE V steepest(const Barrier *t, V *plain) {
     const Lanes *s = &t->lanes;
     V largest = SET(0.0), zero = SET(0.0), one = SET(1.0), g[S], H[S * S], slope[S], bend[S], size[S];
     for (int v = 0; v < S; v++) slope[v] = bend[v] = size[v] = zero;
     for (int64_t k = 0; k <= s->of->N; k++) {
-        const V *x = s->X + k * NX, *u = k < s->of->N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < s->of->N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
         cost_expand(s, k, x, u, g, H);
         for (int v = 0; v < (u ? S : NX); v++) {
@@ -105,7 +105,7 @@ static double first_barrier(const Barrier *t, int l) {
    a bound far away: in a linear programme, and with tiny weights, steps leave the bounds a hundredfold, as little of them
    is taken, and iterations grow with the horizon. Elsewhere 1 would bend the model for nothing. What moving a variable
    leads to counts, too, and a slack as 1 at least: at a bound nearby small slacks hold a step. */
-static void hold_loose(Barrier *t, I of) {
+TGCO_LARGE void hold_loose(Barrier *t, I of) {
     const Lanes *s = &t->lanes;
     I some = of & NOT(of);
     measure_costs(t);
@@ -124,11 +124,11 @@ static void hold_loose(Barrier *t, I of) {
     }
     if (!any(some)) return;
     expand(t);
-    adjoin(t, some, 0);
+    adjoin(t, some, NONE);
 }
 
 /* Lanes `of` have just been loaded: the scale of their cost, slacks and multipliers. */
-static void begin(Barrier *t, Track *k, I of) {
+TGCO_LARGE void begin(Barrier *t, Track *k, I of) {
     V one = SET(1.0), zero = SET(0.0), largest, plain;
     const Interior *how = t->how;
     const Problem *p = t->lanes.of;
@@ -166,16 +166,16 @@ static void begin(Barrier *t, Track *k, I of) {
         }
         EACH_ROW(t, 1, q) t->z[q] = tgco_choose(of, t->scale * t->z[q], t->z[q]);
         expand(t);
-        adjoin(t, of, 0);
+        adjoin(t, of, NONE);
     } else {
         renew(t, of);
         hold_loose(t, of);
     }
-    soften_rows(t, of, SET(how->slight), 0);
+    soften_rows(t, of, SET(how->slight), NONE);
 }
 
 /* The next mu of the lanes whose barrier problem is solved well enough; their filter begins anew. */
-static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V scale_z) {
+TGCO_LARGE void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V scale_z) {
     const Interior *how = t->how;
     V base = most(dual, primal), usual = SET(how->tol * how->mu_floor);
     V smallest = tgco_choose(k->presses, SET(how->mu_min), usual);
@@ -199,7 +199,7 @@ static void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal, V s
 
 /* Factors of all lanes, their curvature shifted where it must be, those of the lanes `anew` from the least shift on;
    lanes that no shift helps leave `running`. */
-static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
+TGCO_LARGE I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
     const Interior *how = t->how;
     t->shift = tgco_choose(anew, k->forced, t->shift);
     I lost = running & NOT(running), open = running & anew; /* others had this shift before */
@@ -218,7 +218,7 @@ static I factor_shifted(Barrier *t, const Track *k, I running, I anew) {
 }
 
 /* Where equalities contradict each other to first order, their multipliers explode: a softer step is taken there. */
-static I soften(Barrier *t, const Track *k, I moving) {
+TGCO_LARGE I soften(Barrier *t, const Track *k, I moving) {
     const Interior *how = t->how;
     for (;;) {
         V largest = SET(0.0);
@@ -236,7 +236,7 @@ static I soften(Barrier *t, const Track *k, I moving) {
 
 /* Lanes whose line search failed look for feasibility alone: steps of least length that close residuals. Where there is
    nothing to close, they start anew with new multipliers and a shift. Returns the lanes that give up. */
-static I recover(Barrier *t, Track *k, I failed) {
+TGCO_LARGE I recover(Barrier *t, Track *k, I failed) {
     const Interior *how = t->how;
     I renewed = failed & NOT(failed), lost = renewed;
     for (int l = 0; l < LANES; l++) {
@@ -254,7 +254,7 @@ static I recover(Barrier *t, Track *k, I failed) {
 }
 
 /* Lanes that have become feasible enough go on with the cost. */
-static void resume(Barrier *t, Track *k) {
+TGCO_LARGE void resume(Barrier *t, Track *k) {
     const Interior *how = t->how;
     I less = k->theta <= SET(how->required_infeasibility_reduction) * k->entered;
     I done = k->restoring & (less | (k->theta <= SET(how->constr_viol_tol)));
@@ -267,7 +267,7 @@ static void resume(Barrier *t, Track *k) {
 
 /* Lanes `of` whose barrier, or what the rows' residuals are worth, is a part of their cost that counts: where the units
    are small, a complementarity or a residual within its tolerance, in all `left`, isn't small beside it. */
-static I barrier_counts(Barrier *t, I of, V *left) {
+TGCO_LARGE I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
     if (t->how->smoothing > 0) return of & NOT(of); /* it is to stay */
     if (!any(of)) return of;
@@ -284,7 +284,7 @@ static I barrier_counts(Barrier *t, I of, V *left) {
 /* Lanes of `running` that end here. Tolerances below the usual rounding are met as well as the iterate can be, as the
    rollout of its controls amplifies gaps: a lane goes on while the error falls, and ends above them where rounding keeps
    it there. So does one whose barrier counts, for as long as this share falls. */
-static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
+TGCO_LARGE I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
     const Interior *how = t->how;
     V zero = SET(0.0), one = SET(1.0), left;
     V idle = tgco_choose(error <= SET(0.5) * k->least, zero, k->idle + one);
@@ -302,26 +302,26 @@ static I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
 }
 
 /* Where a multiplier of an inequality explodes, rows leave each other no room: they are relaxed, as IPOPT's bounds are. */
-static void relax(Barrier *t, Track *k, I running) {
+TGCO_LARGE void relax(Barrier *t, Track *k, I running) {
     V largest = SET(0.0);
     EACH_ROW(t, 0, q) largest = most(t->z[q], largest);
     I lacks = running & (largest > SET(t->how->explodes) * t->raised) & NOT(k->relaxed) & NOT(k->watching);
     if (!any(lacks)) return;
     k->relaxed |= lacks;
-    visit_rows(t, lacks, 1, loosen);
+    visit_rows(t, lacks, 1, CALLED(loosen));
     settle(t, k, lacks, 0);
     renew(t, lacks);
 }
 
 /* Rows that were left out of the lanes `of` come in where they are broken by more than `admitted` and something moves
    them now; returns the lanes with such rows. */
-static I readmit(Barrier *t, Track *k, I of, double admitted) {
+TGCO_LARGE I readmit(Barrier *t, Track *k, I of, double admitted) {
     I broken = of & NOT(of), changed = broken;
     t->admitted = admitted;
     EACH_ROW(t, 0, q) broken |= of & is_broken(t, q);
     if (!any(broken)) return changed;
     EACH_ROW(t, 0, q) t->dz[q] = tgco_truth(t->out[q]); /* no step is under way */
-    visit_rows(t, broken, 0, come_in);
+    visit_rows(t, broken, 0, CALLED(come_in));
     EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
     if (!any(changed)) return changed;
     for (int l = 0; l < LANES; l++) if (LANE(changed, l)) {
@@ -336,7 +336,7 @@ static I readmit(Barrier *t, Track *k, I of, double admitted) {
 }
 
 /* One iteration of the lanes `running`; returns those that end, with their status. */
-static I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
+TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error) {
     const Interior *how = t->how;
     V dual, primal, scale_z;
     if (t->some_out) readmit(t, k, running, how->theta_max_fact); /* beyond which no residual is accepted */
@@ -405,7 +405,7 @@ static V stiffest(const Barrier *t) {
 
 /* Lanes of `ended` from whose iterate the cost falls to second order: the reduced Hessian isn't positive definite. Where
    rows have become so stiff that rounding decides, none. */
-static I find_falls(Barrier *t, I ended) {
+TGCO_LARGE I find_falls(Barrier *t, I ended) {
     V shift = t->shift;
     ended &= stiffest(t) < SET(1.0 / t->how->rounding);
     if (!any(ended)) return ended;
@@ -416,7 +416,7 @@ static I find_falls(Barrier *t, I ended) {
     return ended & NOT(sound);
 }
 
-static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, double error) {
+TGCO_LARGE void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, double error) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N, e = t->lanes.element[lane];
     for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = LANE(t->lanes.X[i], lane);
@@ -439,13 +439,7 @@ static void leave_barrier(Barrier *t, const Track *k, int lane, int32_t status, 
 }
 
 /* How many numbers of a lane a solve has room for. */
-int64_t tgco_room(const Interior *how) {
-    Barrier barrier, *t = &barrier;
-    if (!start_barrier(t, how)) return 0;
-    int64_t count = lay_out(&t->lanes, 0) + shape(t, 0);
-    finish_barrier(t);
-    return count;
-}
+int64_t tgco_room(const Interior *how) { return room_of(how); }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_interior(const Interior *how, int64_t first, int64_t last) {
@@ -455,7 +449,7 @@ int tgco_interior(const Interior *how, int64_t first, int64_t last) {
     memset(k, 0, sizeof *k);
     I running = SET(0.0) == SET(0.0), fresh = running;
     int64_t next = first;
-    double begun = SECONDS_NOW(how);
+    double begun = SECONDS_BEGUN(how);
     int64_t own = last - first < LANES ? last - first : LANES;
     for (int l = 0; l < LANES; l++) { /* lanes without a problem repeat the first problem: its networks are computed once */
         enter_barrier(t, l, l < own ? first + l : first);

@@ -27,7 +27,7 @@ static void measure_room(Barrier *t, I of, int64_t i, int64_t k) {
         if (!are_a_pair(con, j, l)) continue;
         V half = SET(-0.5) * (t->c[q + j] + t->c[q + l]);
         for (int m = 0; m < 2; m++) {
-            V *room = t->room + q + (m ? l : j);
+            OUT room = t->room + q + (m ? l : j);
             *room = tgco_choose(of, least(half, SET(1.0)), *room);
         }
         I same = of & (half == SET(0.0));
@@ -36,14 +36,14 @@ static void measure_room(Barrier *t, I of, int64_t i, int64_t k) {
 }
 
 /* The controls du of knot k that are free, each changed by a number of its own. */
-static void vary_controls(const Barrier *t, int64_t k, V *du) {
+static void vary_controls(const Barrier *t, int64_t k, OUT du) {
     const Problem *p = t->lanes.of;
     for (int j = 0; j < NU; j++) du[j] = SET(uneven(k * NU + j));
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
         for (int j = 0; j < con->rows; j++) if (con->variable[j] >= NX) {
-            V *own = du + con->variable[j] - NX;
+            OUT own = du + con->variable[j] - NX;
             *own = tgco_if(NOT(t->fixes[row_of(t, i, k) + j]), *own);
         }
     }
@@ -51,10 +51,10 @@ static void vary_controls(const Barrier *t, int64_t k, V *du) {
 
 /* The rows of constraint i at knot k that z, a change of the knot's variables, moves: they join `moves`. A change that is
    within rounding of its terms is none. */
-static void find_moved(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z) {
+TGCO_LARGE void find_moved(const Barrier *t, int64_t i, int64_t k, IN x, IN u, const V *z) {
     int rows = t->lanes.of->constraint[i].rows;
-    I *moves = t->moves + row_of(t, i, k);
-    V *change = t->across[0], *part = t->across[1], *terms = t->across[2], own[S];
+    Truths moves = t->moves + row_of(t, i, k);
+    OUT change = t->across[0]; OUT part = t->across[1]; OUT terms = t->across[2]; V own[S];
     along(t, i, k, x, u, z, change);
     for (int j = 0; j < rows; j++) terms[j] = SET(0.0);
     for (int v = 0; v < (u ? S : NX); v++) {
@@ -96,7 +96,7 @@ static int is_visited(const Barrier *t, I of, int all, int64_t i, int64_t k) {
 }
 
 /* How a change of all free variables, each by a number of its own, changes the start. */
-static void vary_start(const Barrier *t, V *dx) {
+static void vary_start(const Barrier *t, OUT dx) {
     for (int i = 0; i < NX; i++) dx[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]), SET(uneven(~i))) : SET(0.0);
 }
 
@@ -121,7 +121,7 @@ static void find_nearby(Barrier *t) {
 
 /* Visits the tight rows of all knots, or `all`. Which of them a change of all free variables moves, `moves`, is seen in two
    trajectories close together: a row may be flat in one point alone. */
-static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
+TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
     const Lanes *s = &t->lanes;
     const Problem *p = s->of;
     int some = 0;
@@ -130,12 +130,12 @@ static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
     memset(t->moves, 0, t->rows * sizeof(I));
     find_nearby(t);
     for (int near = 1; near >= 0; near--) {
-        const V *X = near ? s->Xn : s->X, *U = near ? s->Un : s->U;
+        IN X = near ? s->Xn : s->X; IN U = near ? s->Un : s->U;
         V z[S], f[NJ + 1];
         ask(t, DERIVATIVES, t->live, X, U);
         vary_start(t, z);
         for (int64_t k = 0; k <= p->N; k++) {
-            const V *x = X + k * NX, *u = k < p->N ? U + k * NU : 0;
+            IN x = X + k * NX; IN u = k < p->N ? U + k * NU : 0;
             for (int j = NX; j < S; j++) z[j] = SET(0.0);
             if (u) vary_controls(t, k, z + NX);
             for (int64_t i = 0; i < p->constraints; i++) {
@@ -156,7 +156,7 @@ static void visit_rows(Barrier *t, I of, int all, Visit *visit) {
 static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    const I *moves = t->moves + q;
+    Truths moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I tight = is_tight(t, of, i, k, j), is_state = of & NOT(of);
         if (is_kind(con, BOUNDS) && con->variable[j] < NX) is_state = NOT(is_state);
@@ -175,7 +175,7 @@ static inline I is_broken(const Barrier *t, int64_t q) {
 static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    const I *moves = t->moves + q;
+    Truths moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I in = of & is_broken(t, q + j) & moves[j];
         t->out[q + j] &= NOT(in);
@@ -189,7 +189,7 @@ static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
     const Lanes *s = &t->lanes;
-    V *change = t->across[0], most_room = SET(t->how->relaxes * t->how->constr_viol_tol);
+    OUT change = t->across[0]; V most_room = SET(t->how->relaxes * t->how->constr_viol_tol);
     along(t, i, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
@@ -201,7 +201,7 @@ static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
 }
 
 /* Which rows of the lanes `of`, whose iterate and values c are new, stay out of the barrier. */
-static void sort_rows(Barrier *t, I of) {
+TGCO_LARGE void sort_rows(Barrier *t, I of) {
     const Problem *p = t->lanes.of;
     for (int64_t q = 0; q < t->rows; q++) {
         t->out[q] &= NOT(of); t->fixes[q] &= NOT(of);
@@ -210,14 +210,14 @@ static void sort_rows(Barrier *t, I of) {
     for (int64_t k = 0; k <= p->N; k++)
         for (int64_t i = 0; i < p->constraints; i++)
             if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) measure_room(t, of, i, k);
-    visit_rows(t, of, 0, leave_out);
+    visit_rows(t, of, 0, CALLED(leave_out));
     I some = of & NOT(of);
     for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
     t->some_out = any(some);
 }
 
 /* The squares of the slopes of step at knot k, F_iv^2, into squares (S, NX): a variable after the other. */
-static void square_slopes(const Barrier *t, int64_t k, V *squares) {
+static void square_slopes(const Barrier *t, int64_t k, OUT squares) {
     V own[S];
     for (int v = 0; v < S; v++) {
         for (int w = 0; w < S; w++) own[w] = SET(w == v);
@@ -228,7 +228,7 @@ static void square_slopes(const Barrier *t, int64_t k, V *squares) {
 
 /* What it costs to move the variables of each knot, with all they lead to: of states into dx, of controls into du, which
    hold no step yet. */
-static void measure_costs(Barrier *t) {
+TGCO_LARGE void measure_costs(Barrier *t) {
     const Lanes *s = &t->lanes;
     V g[S], H[S * S], squares[S * NX];
     for (int64_t k = s->of->N; k >= 0; k--) {
@@ -245,16 +245,16 @@ static void measure_costs(Barrier *t) {
 }
 
 /* Rows of constraint i at knot k give way by `share` of J^2 moves, the least of their variables', where they hold. */
-static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V share) {
+static void soften_at(Barrier *t, I of, int64_t i, int64_t k, IN moves, V share) {
     const Lanes *s = &t->lanes;
     const Constraint *con = s->of->constraint + i;
-    const V *x = s->X + k * NX, *u = k < s->of->N ? s->U + k * NU : 0;
+    IN x = s->X + k * NX; IN u = k < s->of->N ? s->U + k * NU : 0;
     int64_t q = row_of(t, i, k);
     int first = 0, end = u ? S : NX;
 #if DIM > 0
     if (is_solid(con)) { first = POSITION; end = POSITION + DIM; }
 #endif
-    V own[S], *change = t->across[0], *least_of = t->across[1];
+    V own[S]; OUT change = t->across[0]; OUT least_of = t->across[1];
     for (int j = 0; j < con->rows; j++) least_of[j] = SET(INFINITY);
     for (int v = first; v < end; v++) {
         for (int w = 0; w < S; w++) own[w] = SET(w == v);
@@ -272,7 +272,7 @@ static void soften_at(Barrier *t, I of, int64_t i, int64_t k, const V *moves, V 
 
 /* Whether a row of constraint i at knot k is one of equalities, or `active`, in one of the lanes `of`; bounds that coincide
    are as stiff as can be: they hide no curvature but their own variable's. */
-static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *active) {
+static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, IN active) {
     const Constraint *con = t->lanes.of->constraint + i;
     if (con->place[k] == NOWHERE) return 0;
     int64_t q = row_of(t, i, k);
@@ -286,9 +286,9 @@ static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, const V *acti
    way by about J^2 `moves`; of that, a `share` is enough. `moves` is how far the cost lets a variable move, squared, the
    inverse of its curvature: of controls that of all they lead to, of states no farther than what controls lead to them.
    Products of different variables don't count, so it is right but for a factor. The slopes f are those of the iterate. */
-static void soften_rows(Barrier *t, I of, V share, const V *active) {
+TGCO_LARGE void soften_rows(Barrier *t, I of, V share, IN active) {
     const Problem *p = t->lanes.of;
-    int some = active != 0;
+    int some = active ? 1 : 0;
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
     for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
     if (!some) return;
@@ -350,7 +350,7 @@ static void join_multipliers(Barrier *t, I of) {
         for (int64_t first = t->first[i]; first < t->first[i] + con->knots * con->rows; first += con->rows)
             for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
                 if (!are_a_pair(con, j, m)) continue;
-                V *z = t->z + first;
+                OUT z = t->z + first;
                 z[j] = tgco_choose(of & t->fixes[first + j], z[j] - z[m], z[j]);
             }
     }

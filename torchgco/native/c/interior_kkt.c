@@ -15,10 +15,10 @@
 
 /* What a solve needs beside the interior point's own memory. */
 typedef struct {
-    V *active, *give; /* (rows): 1 where a row holds, and its D */
-    V *H;           /* (N+1, S, S): curvatures without what holds the rows, upper triangles */
-    V *a, *b, *c;   /* (N+1, S), (N, NX), (rows): a right hand side */
-    V *z, *y, *v;   /* the same: its solution */
+    Numbers active, give; /* (rows): 1 where a row holds, and its D */
+    Numbers H;         /* (N+1, S, S): curvatures without what holds the rows, upper triangles */
+    Numbers a, b, c;   /* (N+1, S), (N, NX), (rows): a right hand side */
+    Numbers z, y, v;   /* the same: its solution */
     V sigma;
 } System;
 
@@ -40,7 +40,7 @@ static void add_all_rows(Barrier *t) {
     const Problem *p = t->lanes.of;
     t->objective = SET(0.0); /* else rows would add multipliers, and their own curvature once more */
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = t->lanes.X + k * NX, *u = k < p->N ? t->lanes.U + k * NU : 0;
+        IN x = t->lanes.X + k * NX; IN u = k < p->N ? t->lanes.U + k * NU : 0;
         for (int64_t i = 0; i < p->constraints; i++)
             if (p->constraint[i].place[k] != NOWHERE) add_rows(t, i, k, x, u);
     }
@@ -48,7 +48,7 @@ static void add_all_rows(Barrier *t) {
 }
 
 /* Costates, then curvatures of all knots with their sigma, and the factors; where these don't exist the answer is false. */
-static I factor_kkt(Barrier *t, System *of, const Kkt *how) {
+TGCO_LARGE I factor_kkt(Barrier *t, System *of, const Kkt *how) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N;
     V largest = SET(0.0);
@@ -59,7 +59,7 @@ static I factor_kkt(Barrier *t, System *of, const Kkt *how) {
     of->sigma = SET(0.0);
     stiffen(t, of); /* infinite slacks: rows have no weight yet */
     expand(t);
-    adjoin(t, all, how->K ? t->lanes.G : 0);
+    adjoin(t, all, how->K ? t->lanes.G : NONE);
     expand(t);
     memcpy(of->H, t->H, (N + 1) * S * S * sizeof(V));
     for (int64_t k = 0; k <= N; k++)
@@ -72,11 +72,11 @@ static I factor_kkt(Barrier *t, System *of, const Kkt *how) {
 }
 
 /* A z of every row into ds, of z as dx and du. */
-static void along_rows(Barrier *t) {
+TGCO_LARGE void along_rows(Barrier *t) {
     const Problem *p = t->lanes.of;
     V z[S];
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = t->lanes.X + k * NX, *u = k < p->N ? t->lanes.U + k * NU : 0;
+        IN x = t->lanes.X + k * NX; IN u = k < p->N ? t->lanes.U + k * NU : 0;
         for (int i = 0; i < NX; i++) z[i] = t->dx[k * NX + i];
         for (int j = 0; j < NU; j++) z[NX + j] = u ? t->du[k * NU + j] : SET(0.0);
         for (int64_t i = 0; i < p->constraints; i++)
@@ -85,11 +85,11 @@ static void along_rows(Barrier *t) {
 }
 
 /* What z, y leave open of stationarity, a + H z + F'y, into g[1], and of the gaps, b + F z, into aim. */
-static void find_open(Barrier *t, const System *of) {
+TGCO_LARGE void find_open(Barrier *t, const System *of) {
     int64_t N = t->lanes.of->N;
     for (int64_t k = 0; k <= N; k++) {
-        const V *H = of->H + k * S * S, *z = of->z + k * S, *next = of->z + (k + 1) * S;
-        V *g = t->g[1] + k * S, ahead[NX], back[S];
+        IN H = of->H + k * S * S; IN z = of->z + k * S; IN next = of->z + (k + 1) * S;
+        OUT g = t->g[1] + k * S; V ahead[NX], back[S];
         for (int i = 0; i < S; i++) {
             g[i] = of->a[k * S + i];
             t->g[2][k * S + i] = back[i] = SET(0.0);
@@ -107,7 +107,7 @@ static void find_open(Barrier *t, const System *of) {
 
 /* Steps that close what is open, from z, y, v = 0 on; returns the largest of c + A z - D v of active rows at the end. What is
    open of rows is counted in c itself: v, in which it is multiplied by sigma, would magnify the rounding of c + A z. */
-static V solve_kkt(Barrier *t, System *of, int64_t rounds) {
+TGCO_LARGE V solve_kkt(Barrier *t, System *of, int64_t rounds) {
     int64_t N = t->lanes.of->N;
     memset(of->z, 0, (N + 1) * S * sizeof(V));
     memset(of->y, 0, N * NX * sizeof(V));
@@ -172,28 +172,36 @@ static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64
     }
 }
 
-static V *start_system(System *of, const Problem *p, int64_t rows) {
+static int64_t lay_out_system(System *of, const Problem *p, int64_t rows, Numbers memory) {
     int64_t N = p->N, point = (N + 1) * S, gaps = N * NX;
-    V *memory = take(p, ((N + 1) * S * S + 2 * (point + gaps + rows) + 2 * rows + 1) * sizeof(V));
     Cut m = {memory, 0};
-    if (!memory) return 0;
     of->H = cut(&m, (N + 1) * S * S); of->active = cut(&m, rows); of->give = cut(&m, rows);
     of->a = cut(&m, point); of->b = cut(&m, gaps); of->c = cut(&m, rows);
     of->z = cut(&m, point); of->y = cut(&m, gaps); of->v = cut(&m, rows);
-    return memory;
+    return m.used;
+}
+
+/* How many numbers of a lane a solve of these systems has room for. */
+int64_t tgco_kkt_room(const Kkt *how) {
+    Interior options = {.of = how->of, .free_start = how->free_start};
+    System system;
+    int64_t rows = 0;
+    for (int64_t i = 0; i < how->of->constraints; i++) rows += how->of->constraint[i].knots * how->of->constraint[i].rows;
+    return room_of(&options) + lay_out_system(&system, how->of, rows, 0) + 1;
 }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     Interior options = {
-        .of = how->of, .free_start = how->free_start, .ask = how->ask, .pivot = how->pivot,
-        .constr_mult_init_max = INFINITY};
+        .of = how->of, .free_start = how->free_start, .ask = how->ask, .constr_mult_init_max = INFINITY,
+        .pivot = how->pivot};
     Barrier barrier, *t = &barrier;
     System system, *of = &system;
     if (!start_barrier(t, &options)) return 0;
     const Problem *p = t->lanes.of;
-    V *memory = start_system(of, p, t->rows);
+    Numbers memory = take_numbers(p, lay_out_system(of, p, t->rows, 0) + 1);
     if (!memory) { finish_barrier(t); return 0; }
+    lay_out_system(of, p, t->rows, memory);
     for (int64_t at = first; at < last; at += LANES) {
         int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
         for (int l = 0; l < LANES; l++) {

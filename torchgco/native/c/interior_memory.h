@@ -19,7 +19,7 @@ typedef struct {
     I watching; /* a step was taken on trial; theta, phi, slope and alpha are those before it */
 } Track;
 
-static int64_t shape(Barrier *t, V *memory) {
+static int64_t shape(Barrier *t, Numbers memory) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N, rows = t->rows;
     Cut m = {memory, 0};
@@ -34,9 +34,9 @@ static int64_t shape(Barrier *t, V *memory) {
     t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
     t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
     for (int i = 0; i < 3; i++) t->across[i] = cut(&m, t->widest);
-    t->moves = (I *)cut(&m, rows);
+    t->moves = (Truths)cut(&m, rows);
     t->room = cut(&m, rows); t->relaxed = cut(&m, rows); t->gives = cut(&m, rows);
-    t->out = (I *)cut(&m, rows); t->fixes = (I *)cut(&m, rows);
+    t->out = (Truths)cut(&m, rows); t->fixes = (Truths)cut(&m, rows);
     t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
     return m.used;
 }
@@ -52,24 +52,33 @@ static int start_barrier(Barrier *t, const Interior *how) {
     memset(t, 0, sizeof *t);
     t->how = how;
     if (!start(&t->lanes, p)) return 0;
-    t->first = take(p, (p->constraints + 1) * sizeof *t->first);
-    t->rows_asked = take(p, (p->constraints + 1) * sizeof *t->rows_asked);
+    t->first = (int64_t *)take(p, (p->constraints + 1) * sizeof *t->first);
+    t->rows_asked = (double **)take(p, (p->constraints + 1) * sizeof *t->rows_asked);
     if (!t->first || !t->rows_asked) { finish_barrier(t); return 0; }
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *con = p->constraint + i;
         t->first[i + 1] = t->rows += con->knots * con->rows;
         if (con->rows > t->widest) t->widest = con->rows;
-        t->rows_asked[i] = (double *)t->lanes.rows[i].bound;
+        t->rows_asked[i] = ADDRESS(t->lanes.rows[i].bound);
     }
     int64_t count = shape(t, 0);
-    t->memory = take(p, (count + 1) * sizeof(V));
+    t->memory = take_numbers(p, count + 1);
     if (!t->memory) { finish_barrier(t); return 0; }
     shape(t, t->memory);
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = SET(1.0);
     return 1;
 }
 
-static void enter_barrier(Barrier *t, int lane, int64_t e) {
+/* How many numbers of a lane that takes. */
+static int64_t room_of(const Interior *how) {
+    Barrier barrier, *t = &barrier;
+    if (!start_barrier(t, how)) return 0;
+    int64_t count = lay_out(&t->lanes, 0) + shape(t, 0) + 2;
+    finish_barrier(t);
+    return count;
+}
+
+TGCO_LARGE void enter_barrier(Barrier *t, int lane, int64_t e) {
     enter_iterate(&t->lanes, lane, e);
     if (t->is_free) for (int i = 0; i < NX; i++) LANE(t->is_free[i], lane) = t->how->free_start[e * NX + i];
 }
@@ -90,7 +99,7 @@ static inline int64_t next_of(const Barrier *t, int equality, int64_t i) {
         for (int64_t q = (t)->first[i_], end_ = (t)->first[i_ + 1]; q < end_; q++)
 
 /* Sum of the logarithms of the slacks, by their product: one logarithm for all rows. */
-static V logarithms(const Barrier *t, const V *s) {
+TGCO_LARGE V logarithms(const Barrier *t, IN s) {
     V product = SET(1.0), exponents = SET(0.0);
     int count = 0;
     EACH_ROW(t, 0, q) {
@@ -103,7 +112,7 @@ static V logarithms(const Barrier *t, const V *s) {
     return tgco_log(product) + SET(0x1.62e42fefa39efp-1) * exponents;
 }
 
-static V size_of(const Barrier *t, const V *gap, const V *r) {
+TGCO_LARGE V size_of(const Barrier *t, IN gap, IN r) {
     V sum = SET(0.0);
     for (int64_t i = 0; i < t->lanes.of->N * NX; i++) sum += tgco_fabs(gap[i]);
     for (int64_t q = 0; q < t->rows; q++) sum += tgco_fabs(r[q]);
@@ -115,12 +124,12 @@ static V size_of(const Barrier *t, const V *gap, const V *r) {
 /* Costates of the lanes `of` that make the Lagrangian stationary in the states; none where they are too large. With
    `gains` stationary along the feedback u + G (x - X): where it is stationary in the controls these are the same, but
    unstable dynamics don't magnify rounding from stage to stage. */
-static void adjoin(Barrier *t, I of, const V *gains) {
+TGCO_LARGE void adjoin(Barrier *t, I of, IN gains) {
     const Problem *p = t->lanes.of;
     V largest = SET(0.0), q[S];
     memset(t->yn, 0, (p->N + 1) * NX * sizeof(V));
     for (int64_t k = p->N; k > 0; k--) {
-        V *y = t->yn + k * NX;
+        OUT y = t->yn + k * NX;
         for (int i = 0; i < S; i++) q[i] = SET(0.0);
         if (k < p->N) model_pull_back(y + NX, t->f + k * NJ, q);
         for (int i = 0; i < NX; i++) {
@@ -135,18 +144,18 @@ static void adjoin(Barrier *t, I of, const V *gains) {
 }
 
 /* Multipliers anew for the lanes `of`: those of the central path, and none of equalities. */
-static void renew(Barrier *t, I of) {
+TGCO_LARGE void renew(Barrier *t, I of) {
     EACH_ROW(t, 0, q) t->z[q] = tgco_choose(of, by_role(t, q, t->mu / t->s[q], SET(0.0)), t->z[q]);
     EACH_ROW(t, 1, q) t->z[q] = tgco_choose(of, SET(0.0), t->z[q]);
     V objective = t->objective;
     t->objective = tgco_choose(of, SET(1.0), objective);
     expand(t);
-    adjoin(t, of, 0);
+    adjoin(t, of, NONE);
     t->objective = objective;
 }
 
 /* The end test: largest slopes of the Lagrangian and residuals, both scaled as in the paper. */
-static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
+TGCO_LARGE void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
     const Problem *p = t->lanes.of;
     V slope = SET(0.0), gap = SET(0.0), sum_y = SET(0.0), sum_z = SET(0.0), q[S];
     for (int64_t k = 0; k <= p->N; k++) {
@@ -171,7 +180,7 @@ static void errors(Barrier *t, V *dual, V *primal, V *scale_z) {
     *scale_z = usual / most(mean_z, usual);
 }
 
-static V complementarity(const Barrier *t, V mu) {
+TGCO_LARGE V complementarity(const Barrier *t, V mu) {
     V worst = SET(0.0);
     EACH_ROW(t, 0, q) worst = most(by_role(t, q, tgco_fabs(t->s[q] * t->z[q] - mu), SET(0.0)), worst);
     return worst;

@@ -11,14 +11,14 @@ static inline int64_t row_of(const Barrier *t, int64_t i, int64_t k) {
 
 #if DIM > 0
 /* Values c of obstacles at knot k. */
-static inline void solids_at(const Constraint *con, const Rows *rows, int64_t k, const V *x, V *c) {
+static inline void solids_at(const Constraint *con, const Rows *rows, int64_t k, IN x, OUT c) {
     V away[DIM];
     if (is_kind(con, SPHERES)) for (int j = 0; j < con->rows; j++) c[j] = sphere(con, rows, j, k, x, away);
-    else if (is_kind(con, BOXES)) for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, 0);
-    else if (is_kind(con, FIELD)) c[0] = field_row(con, rows, k, x, 0, 0);
+    else if (is_kind(con, BOXES)) for (int j = 0; j < con->rows; j++) c[j] = solid(con, rows, j, k, x, NONE);
+    else if (is_kind(con, FIELD)) c[0] = field_row(con, rows, k, x, NONE, NONE);
 }
 
-static void body_at(const Lanes *s, int64_t i, int64_t k, const V *x, V *c) {
+static void body_at(const Lanes *s, int64_t i, int64_t k, IN x, OUT c) {
     const Constraint *con = s->of->constraint + i;
     V centers[MAX_ROWS];
     Ball ball;
@@ -31,7 +31,7 @@ static void body_at(const Lanes *s, int64_t i, int64_t k, const V *x, V *c) {
 #endif
 
 /* Values c of constraint i at knot k. */
-static inline void rows_at(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V *c) {
+static inline void rows_at(const Lanes *s, int64_t i, int64_t k, IN x, IN u, OUT c) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     if (is_kind(con, BOUNDS)) {
@@ -68,22 +68,20 @@ static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
 }
 
 #if DIM > 0
-/* Where rows of the position add: gradients of the parts (POSITION + DIM at least), and an upper triangle by rows of S. */
-typedef struct { V *g[PARTS], *H; } Into;
-
-/* A row of the position alone, with its slopes and lam times its curvature (DIM, DIM), upper triangle. */
-static inline void add_row(const Barrier *t, Into to, int64_t q, const V *slopes, const V *curvature) {
+/* A row of the position alone, with its slopes and lam times its curvature (DIM, DIM), upper triangle. It and those that follow
+   add to gradients of the parts, g (POSITION + DIM at least), and to an upper triangle H by rows of S. */
+static inline void add_row(const Barrier *t, OUTS g, OUT H, int64_t q, IN slopes, IN curvature) {
     V by[PARTS], cc = weigh(t, 0, q, by);
     for (int a = 0; a < DIM; a++) {
-        for (int part = 0; part < PARTS; part++) ADD(to.g[part][POSITION + a], by[part], slopes[a]);
+        for (int part = 0; part < PARTS; part++) ADD(g[part][POSITION + a], by[part], slopes[a]);
         for (int b = a; b < DIM; b++)
-            to.H[(POSITION + a) * S + POSITION + b] += cc * slopes[a] * slopes[b] + curvature[a * DIM + b];
+            H[(POSITION + a) * S + POSITION + b] += cc * slopes[a] * slopes[b] + curvature[a * DIM + b];
     }
 }
 
 /* Those that follow add the rows of obstacles, which begin at row q, at knot k. */
 static inline void add_spheres(
-    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
+    const Barrier *t, OUTS g, OUT H, const Constraint *con, const Rows *rows, int64_t q, int64_t k, IN x) {
     for (int j = 0; j < con->rows; j++, q++) {
         V slopes[DIM], curvature[DIM * DIM], bend;
         sphere(con, rows, j, k, x, slopes);
@@ -92,7 +90,7 @@ static inline void add_spheres(
             slopes[a] *= SET(-2.0);
             for (int b = 0; b < DIM; b++) curvature[a * DIM + b] = a == b ? bend : SET(0.0);
         }
-        add_row(t, to, q, slopes, curvature);
+        add_row(t, g, H, q, slopes, curvature);
     }
 }
 #endif
@@ -100,8 +98,8 @@ static inline void add_spheres(
 #if DIM > 0
 /* lam times the second derivatives of row j (DIM, DIM): distances bend around edges and corners, not along faces. */
 static inline void bend_box(
-    const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V lam, V *curvature) {
-    const V *factors = rows->bound + con->rows * 2 * DIM, *box = factors + con->rows + j * BOX_NUMBERS;
+    const Constraint *con, const Rows *rows, int64_t j, int64_t k, IN x, V lam, OUT curvature) {
+    IN factors = rows->bound + con->rows * 2 * DIM; IN box = factors + con->rows + j * BOX_NUMBERS;
     V zero = SET(0.0), local[DIM], away[DIM], square = zero;
     seen_from(box, x + POSITION, local);
     for (int i = 0; i < DIM; i++) { away[i] = beyond(local[i], BOX_HALF(box)[i]); ADD(square, away[i], away[i]); }
@@ -120,63 +118,63 @@ static inline void bend_box(
 }
 
 static inline void add_boxes(
-    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
+    const Barrier *t, OUTS g, OUT H, const Constraint *con, const Rows *rows, int64_t q, int64_t k, IN x) {
     V slopes[DIM], curvature[DIM * DIM];
     for (int j = 0; j < con->rows; j++, q++) {
         solid(con, rows, j, k, x, slopes);
         bend_box(con, rows, j, k, x, t->objective * t->z[q], curvature);
-        add_row(t, to, q, slopes, curvature);
+        add_row(t, g, H, q, slopes, curvature);
     }
 }
 
 static inline void add_field(
-    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
+    const Barrier *t, OUTS g, OUT H, const Constraint *con, const Rows *rows, int64_t q, int64_t k, IN x) {
     V slopes[DIM], curvature[DIM * DIM], lam = t->objective * t->z[q];
     field_row(con, rows, k, x, slopes, curvature);
     for (int a = 0; a < DIM; a++) for (int b = a; b < DIM; b++) curvature[a * DIM + b] *= lam;
-    add_row(t, to, q, slopes, curvature);
+    add_row(t, g, H, q, slopes, curvature);
 }
 
 /* The same of any kind. */
 static inline void add_solids(
-    const Barrier *t, Into to, const Constraint *con, const Rows *rows, int64_t q, int64_t k, const V *x) {
-    if (is_kind(con, SPHERES)) add_spheres(t, to, con, rows, q, k, x);
-    else if (is_kind(con, BOXES)) add_boxes(t, to, con, rows, q, k, x);
-    else if (is_kind(con, FIELD)) add_field(t, to, con, rows, q, k, x);
+    const Barrier *t, OUTS g, OUT H, const Constraint *con, const Rows *rows, int64_t q, int64_t k, IN x) {
+    if (is_kind(con, SPHERES)) add_spheres(t, g, H, con, rows, q, k, x);
+    else if (is_kind(con, BOXES)) add_boxes(t, g, H, con, rows, q, k, x);
+    else if (is_kind(con, FIELD)) add_field(t, g, H, con, rows, q, k, x);
 }
 
 /* Rows of a body: each ball's by its center, then by the state, with the curvature of its way. */
-static void add_body(Barrier *t, int64_t i, int64_t k, const V *x) {
+static void add_body(Barrier *t, int64_t i, int64_t k, IN x) {
     const Lanes *s = &t->lanes;
     const Constraint *con = s->of->constraint + i;
-    const V *numbers = at(s->rows[i].lift, &con->lift, con->place[k]);
+    IN numbers = at(s->rows[i].lift, &con->lift, con->place[k]);
     int64_t q = row_of(t, i, k), P = con->balls;
-    V centers[MAX_ROWS], e[MAX_ROWS * S], own[PARTS * (POSITION + DIM)], square[(POSITION + DIM) * S], *H = t->H + k * S * S;
-    V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], *g[PARTS];
+    V centers[MAX_ROWS], e[MAX_ROWS * S], own[PARTS * (POSITION + DIM)], square[(POSITION + DIM) * S];
+    V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], *of_ball[PARTS];
+    Numbers g[PARTS], H = t->H + k * S * S;
     const int *columns;
-    Into to = {.H = square};
     Ball ball;
     ball_centers(s, i, k, x, centers);
-    int count = model_slopes((int)i, x, 0, numbers, con->shared, e, &columns);
+    int count = model_slopes((int)i, x, NONE, numbers, con->shared, e, &columns);
     for (int part = 0; part < PARTS; part++) {
-        to.g[part] = own + part * (POSITION + DIM);
+        of_ball[part] = own + part * (POSITION + DIM);
         g[part] = t->g[part] + k * S;
     }
     for (int b = 0; b < P; b++) {
         ball_at(con, s->rows + i, b, k, centers + b * DIM, &ball);
         for (int a = POSITION; a < POSITION + DIM; a++) {
-            for (int part = 0; part < PARTS; part++) to.g[part][a] = SET(0.0);
+            for (int part = 0; part < PARTS; part++) of_ball[part][a] = SET(0.0);
             for (int c = POSITION; c < POSITION + DIM; c++) square[a * S + c] = SET(0.0);
         }
-        add_solids(t, to, &ball.con, &ball.rows, q + b * ball.con.rows, k, ball.x);
+        add_solids(t, of_ball, square, &ball.con, &ball.rows, q + b * ball.con.rows, k, ball.x);
         pull_square(count, columns, e + b * DIM * count, square + POSITION * S, H);
         for (int a = 0; a < DIM; a++) {
-            for (int part = 0; part < PARTS; part++) by[part * MAX_ROWS + b * DIM + a] = to.g[part][POSITION + a];
+            for (int part = 0; part < PARTS; part++) by[part * MAX_ROWS + b * DIM + a] = of_ball[part][POSITION + a];
             cc[b * DIM + a] = SET(0.0);
-            lam[b * DIM + a] = t->objective * to.g[0][POSITION + a]; /* by[0] are multipliers: weigh */
+            lam[b * DIM + a] = t->objective * of_ball[0][POSITION + a]; /* by[0] are multipliers: weigh */
         }
     }
-    model_bend_rows((int)i, x, 0, numbers, con->shared, by, cc, lam, g, H);
+    model_bend_rows((int)i, x, NONE, numbers, con->shared, by, cc, lam, g, H);
 }
 #endif
 
@@ -192,16 +190,16 @@ static inline void add_bounds(Barrier *t, int64_t i, int64_t k) {
 }
 
 /* Adds constraint i at knot k to the model of a step. */
-static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const V *u) {
+static inline void add_rows(Barrier *t, int64_t i, int64_t k, IN x, IN u) {
     const Constraint *con = t->lanes.of->constraint + i;
     const Rows *rows = t->lanes.rows + i;
     if (is_kind(con, BOUNDS)) { add_bounds(t, i, k); return; }
 #if DIM > 0
     if (is_kind(con, BODY)) { add_body(t, i, k, x); return; }
     if (is_solid(con)) {
-        Into to = {.H = t->H + k * S * S};
-        for (int part = 0; part < PARTS; part++) to.g[part] = t->g[part] + k * S;
-        add_solids(t, to, con, rows, row_of(t, i, k), k, x);
+        Numbers g[PARTS], H = t->H + k * S * S;
+        for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
+        add_solids(t, g, H, con, rows, row_of(t, i, k), k, x);
         return;
     }
 #endif
@@ -213,16 +211,16 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, const V *x, const 
         for (int part = 0; part < PARTS; part++) by[part * MAX_ROWS + j] = own[part];
         lam[j] = t->objective * t->z[q + j];
     }
-    V *g[PARTS];
+    Numbers g[PARTS];
     for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
-    const V *numbers = at(rows->bound, &con->bound, con->place[k]);
+    IN numbers = at(rows->bound, &con->bound, con->place[k]);
     model_bend_rows((int)i, x, u, numbers, con->shared, by, cc, lam, g, t->H + k * S * S);
 }
 
 #if DIM > 0
 /* The change of rows of obstacles at knot k where the position changes by `step` (DIM), into out. */
 static inline void solids_along(
-    const Constraint *con, const Rows *rows, int64_t k, const V *x, const V *step, V *out) {
+    const Constraint *con, const Rows *rows, int64_t k, IN x, IN step, OUT out) {
     V slopes[DIM];
     for (int j = 0; j < con->rows; j++) {
         out[j] = SET(0.0);
@@ -232,12 +230,12 @@ static inline void solids_along(
             continue;
         }
         if (is_kind(con, BOXES)) solid(con, rows, j, k, x, slopes);
-        else if (is_kind(con, FIELD)) field_row(con, rows, k, x, slopes, 0);
+        else if (is_kind(con, FIELD)) field_row(con, rows, k, x, slopes, NONE);
         for (int a = 0; a < DIM; a++) ADD(out[j], slopes[a], step[a]);
     }
 }
 
-static void body_along(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
+static void body_along(const Lanes *s, int64_t i, int64_t k, IN x, IN u, IN z, OUT out) {
     const Constraint *con = s->of->constraint + i;
     V centers[MAX_ROWS], steps[MAX_ROWS];
     Ball ball;
@@ -251,7 +249,7 @@ static void body_along(const Lanes *s, int64_t i, int64_t k, const V *x, const V
 #endif
 
 /* The change of the rows of constraint i at knot k along z = [dx, du], into out. */
-static inline void along(const Barrier *t, int64_t i, int64_t k, const V *x, const V *u, const V *z, V *out) {
+static inline void along(const Barrier *t, int64_t i, int64_t k, IN x, IN u, IN z, OUT out) {
     const Constraint *con = t->lanes.of->constraint + i;
     const Rows *rows = t->lanes.rows + i;
     if (is_kind(con, BOUNDS)) {

@@ -49,7 +49,7 @@ static int is_good(
 /* The line search ------------------------------------------------------------------------------------------------- */
 
 /* The longest steps that leave a share 1 - tau of slacks and multipliers. */
-static void longest(const Barrier *t, V tau, V *primal, V *dual) {
+TGCO_LARGE void longest(const Barrier *t, V tau, V *primal, V *dual) {
     *primal = *dual = SET(1.0);
     EACH_ROW(t, 0, q) {
         V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
@@ -61,7 +61,7 @@ static void longest(const Barrier *t, V tau, V *primal, V *dual) {
 }
 
 /* The trial of the lanes `of` at step lengths alpha: its theta and phi. */
-static void attempt(Barrier *t, I of, V alpha, V *theta, V *phi) {
+TGCO_LARGE void attempt(Barrier *t, I of, V alpha, V *theta, V *phi) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
     for (int64_t i = 0; i < (N + 1) * NX; i++) s->Xn[i] = s->X[i] + alpha * t->dx[i];
@@ -81,11 +81,11 @@ static void attempt(Barrier *t, I of, V alpha, V *theta, V *phi) {
 }
 
 /* The slope of phi along the step. */
-static V descent(const Barrier *t) {
+TGCO_LARGE V descent(const Barrier *t) {
     const Problem *p = t->lanes.of;
     V sum = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *slope = t->cost_slope + k * S;
+        IN slope = t->cost_slope + k * S;
         for (int i = 0; i < NX; i++) ADD(sum, slope[i], t->dx[k * NX + i]);
         if (k < p->N) for (int j = 0; j < NU; j++) ADD(sum, slope[NX + j], t->du[k * NU + j]);
     }
@@ -94,7 +94,7 @@ static V descent(const Barrier *t) {
 }
 
 /* Second-order correction of the lanes `of`: a step that closes what the trial at alpha left, too. */
-static void correct(Barrier *t, I of, V alpha) {
+TGCO_LARGE void correct(Barrier *t, I of, V alpha) {
     for (int64_t i = 0; i < t->lanes.of->N * NX; i++)
         t->aim[i] = tgco_choose(of, alpha * t->aim[i] + t->gapn[i], t->aim[i]);
     EACH_ROW(t, 0, q) {
@@ -108,7 +108,7 @@ static void correct(Barrier *t, I of, V alpha) {
 }
 
 /* Back to the step for the iterate's own residuals. */
-static void uncorrect(Barrier *t) {
+TGCO_LARGE void uncorrect(Barrier *t) {
     memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     residuals(t, t->c, t->s, t->r);
     expand(t);
@@ -116,7 +116,7 @@ static void uncorrect(Barrier *t) {
     solve_rows(t);
 }
 
-static void accept(Barrier *t, I won, V alpha, V dual) {
+TGCO_LARGE void accept(Barrier *t, I won, V alpha, V dual) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
     V bound = SET(t->how->kappa_sigma), step = alpha;
@@ -137,15 +137,15 @@ static void accept(Barrier *t, I won, V alpha, V dual) {
 }
 
 /* Keeps the iterate of the lanes `of`, or goes back to it. */
-static void keep(Barrier *t, I of, int back) {
+TGCO_LARGE void keep(Barrier *t, I of, int back) {
     const Lanes *s = &t->lanes;
     int64_t N = s->of->N;
-    V *kept = t->kept;
-    struct { V *values; int64_t count; } parts[] = {
+    OUT kept = t->kept;
+    struct { Numbers values; int64_t count; } parts[] = {
         {s->X, (N + 1) * NX}, {t->y, (N + 1) * NX}, {s->U, N * NU}, {t->gap, N * NX},
         {t->c, t->rows}, {t->s, t->rows}, {t->z, t->rows}};
     for (int part = 0; part < (int)(sizeof parts / sizeof *parts); part++) {
-        V *values = parts[part].values;
+        OUT values = parts[part].values;
         for (int64_t i = 0; i < parts[part].count; i++, kept++)
             if (back) values[i] = tgco_choose(of, *kept, values[i]); else *kept = tgco_choose(of, values[i], *kept);
     }
@@ -171,7 +171,7 @@ static void go_back(Barrier *t, Track *k, I of) {
 
 /* Moves the lanes `moving` along their steps; returns those that found a step length. A lane moves as soon as it has
    found it; what is computed for it from there on is not used. */
-static I search(Barrier *t, Track *k, I moving, V tau) {
+TGCO_LARGE I search(Barrier *t, Track *k, I moving, V tau) {
     const Interior *how = t->how;
     V full, alpha, dual, theta, phi, slope = descent(t);
     longest(t, tau, &full, &dual);

@@ -2,28 +2,16 @@
    multipliers. */
 #pragma once
 #include "interior_rows.h"
-
-/* Has Python compute the functions of the lanes `of` at X, U, where C doesn't. */
-static void ask(const Barrier *t, int asked, I of, const V *X, const V *U) {
-    const Lanes *s = &t->lanes;
-    if (!t->how->ask) return;
-    Request request = {
-        .asked = asked, .element = s->element, .X = (double *)X, .U = (double *)U, .Xn = (double *)s->Xn,
-        .Un = (double *)s->Un, .y = (double *)t->y, .z = (double *)t->z, .objective = (double *)&t->objective,
-        .step = (double *)s->parameters, .stage = (double *)s->cost_data[STAGE],
-        .last = (double *)s->cost_data[LAST], .rows = t->rows_asked};
-    for (int l = 0; l < LANES; l++) if (LANE(of, l)) request.lanes |= (int64_t)1 << l;
-    if (request.lanes) t->how->ask(&request);
-}
+#include "asking.h"
 
 /* Values of the lanes `of` along X, U into c and gap; returns the cost. */
-static V values(const Barrier *t, I of, const V *X, const V *U, V *c, V *gap) {
+TGCO_LARGE V values(const Barrier *t, I of, IN X, IN U, OUT c, OUT gap) {
     const Lanes *s = &t->lanes;
     ask(t, VALUES, of, X, U);
     const Problem *p = s->of;
     V total = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = X + k * NX, *u = k < p->N ? U + k * NU : 0;
+        IN x = X + k * NX; IN u = k < p->N ? U + k * NU : 0;
         for (int64_t i = 0; i < p->constraints; i++) {
             if (p->constraint[i].place[k] == NOWHERE) continue;
             int64_t q = row_of(t, i, k), end = q + p->constraint[i].rows;
@@ -40,7 +28,7 @@ static V values(const Barrier *t, I of, const V *X, const V *U, V *c, V *gap) {
 }
 
 /* Residuals of the rows: c + s, or c of equalities. */
-static void residuals(const Barrier *t, const V *c, const V *s, V *r) {
+TGCO_LARGE void residuals(const Barrier *t, IN c, IN s, OUT r) {
     const Problem *p = t->lanes.of;
     for (int64_t i = 0, q = 0; i < p->constraints; i++)
         for (int64_t end = q + p->constraint[i].knots * p->constraint[i].rows; q < end; q++)
@@ -48,14 +36,14 @@ static void residuals(const Barrier *t, const V *c, const V *s, V *r) {
 }
 
 /* Slopes and curvatures of all knots at the iterate. */
-static void expand(Barrier *t) {
+TGCO_LARGE void expand(Barrier *t) {
     Lanes *s = &t->lanes;
     const Problem *p = s->of;
     V weight = t->scale * t->objective;
     ask(t, DERIVATIVES, t->live, s->X, s->U);
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
-        V *H = t->H + k * S * S, *slope = t->cost_slope + k * S;
+        IN x = s->X + k * NX; IN u = k < p->N ? s->U + k * NU : 0;
+        OUT H = t->H + k * S * S; OUT slope = t->cost_slope + k * S;
         for (int i = 0; i < S; i++) memset(H + i * S + i, 0, (S - i) * sizeof(V)); /* the lower triangle isn't used */
         memset(slope, 0, S * sizeof(V));
         cost_expand(s, k, x, u, slope, H);
@@ -75,12 +63,12 @@ static void expand(Barrier *t) {
 }
 
 /* The step of slacks and multipliers that belongs to dx, du. */
-static void solve_rows(Barrier *t) {
+TGCO_LARGE void solve_rows(Barrier *t) {
     const Lanes *s = &t->lanes;
     const Problem *p = s->of;
     V z[S];
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < p->N ? s->U + k * NU : 0;
         for (int i = 0; i < NX; i++) z[i] = t->dx[k * NX + i];
         for (int j = 0; j < NU; j++) z[NX + j] = u ? t->du[k * NU + j] : SET(0.0);
         for (int64_t i = 0; i < p->constraints; i++) {

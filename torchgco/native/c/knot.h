@@ -11,8 +11,8 @@
 #if DIM > 0
 /* The same of row j, whose value is c. */
 static inline V sphere_terms(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V c, V lam, V total,
-    V *g, V *H) {
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t j, int64_t k, IN x, V c, V lam, V total,
+    OUT g, OUT H) {
     if (!g) return total + worth(s, 0, c, lam);
     if (!any(NOT(c <= SET(0.0)) | (lam != SET(0.0)))) return total;
     V away[DIM], rho, slope = pull(s, 0, sphere(con, rows, j, k, x, away), lam, &rho);
@@ -24,8 +24,8 @@ static inline V sphere_terms(
 }
 
 TGCO_INLINE V spheres_terms(
-    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, V total, V *g, V *H) {
-    const V *lam = rows->lam + con->place[k] * con->rows;
+    const Lanes *s, const Constraint *con, const Rows *rows, int64_t k, IN x, V total, OUT g, OUT H) {
+    IN lam = rows->lam + con->place[k] * con->rows;
     V c[BLOCK];
     for (int64_t first = 0; first < con->rows; first += BLOCK) {
         int64_t last = first + BLOCK < con->rows ? first + BLOCK : con->rows;
@@ -37,10 +37,10 @@ TGCO_INLINE V spheres_terms(
 }
 
 /* Of the spheres of a body, in order, those that a ball may touch in any lane at knot k, or that have a multiplier. */
-static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V *centers, int64_t *near) {
+static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, IN centers, Places near) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
-    const V *lam = rows->lam + con->place[k] * con->rows, *o = at(rows->bound, &con->bound, con->place[k]);
+    IN lam = rows->lam + con->place[k] * con->rows; IN o = at(rows->bound, &con->bound, con->place[k]);
     int64_t P = con->balls, each = con->rows / P, count = 0;
     int pushed = any(rows->pushed[con->place[k]]);
     V middle[DIM], reach = SET(0.0);
@@ -72,8 +72,8 @@ static inline int64_t spheres_near(const Lanes *s, int64_t i, int64_t k, const V
 }
 
 TGCO_INLINE V near_terms(
-    const Lanes *s, const Ball *ball, int64_t k, const int64_t *near, int64_t count, V total, V *g, V *H) {
-    const V *lam = ball->rows.lam + ball->con.place[k] * ball->con.rows;
+    const Lanes *s, const Ball *ball, int64_t k, Places near, int64_t count, V total, OUT g, OUT H) {
+    IN lam = ball->rows.lam + ball->con.place[k] * ball->con.rows;
     V away[DIM];
     for (int64_t i = 0; i < count; i++) {
         V c = sphere(&ball->con, &ball->rows, near[i], k, ball->x, away);
@@ -83,11 +83,12 @@ TGCO_INLINE V near_terms(
 }
 
 /* Rows of a body, ball by ball. */
-TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, const V *x, V total, V *g, V *H) {
+TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, IN x, V total, OUT g, OUT H) {
     const Constraint *con = s->of->constraint + i;
-    V centers[MAX_ROWS], e[MAX_ROWS * S], by[POSITION + DIM], square[(POSITION + DIM) * S], *own = g ? by : 0;
+    V centers[MAX_ROWS], e[MAX_ROWS * S], by[POSITION + DIM], square[(POSITION + DIM) * S], *own = g ? by : NULL;
     const int *columns = 0;
-    int64_t *near = s->rows[i].near, some = 0;
+    Places near = s->rows[i].near;
+    int64_t some = 0;
     int count = -1;
     Ball ball;
     ball_centers(s, i, k, x, centers);
@@ -104,7 +105,7 @@ TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, const V *x, V tota
         if (!g || adds_nothing(own + POSITION, square + POSITION * S)) continue;
         if (count < 0)
             count = model_slopes(
-                (int)i, x, 0, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, e, &columns);
+                (int)i, x, NONE, at(s->rows[i].lift, &con->lift, con->place[k]), con->shared, e, &columns);
         pull_slope(count, columns, e + b * DIM * count, own + POSITION, g);
         pull_square(count, columns, e + b * DIM * count, square + POSITION * S, H);
     }
@@ -114,9 +115,9 @@ TGCO_APART V body_terms(const Lanes *s, int64_t i, int64_t k, const V *x, V tota
 
 /* Rows that are traced, in a function of their own: room for any number of them would cost the others time. */
 TGCO_APART V traced_terms(
-    const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, const V *lam, V total, V *g, V *H) {
+    const Lanes *s, int64_t i, int64_t k, IN x, IN u, IN lam, V total, OUT g, OUT H) {
     const Constraint *con = s->of->constraint + i;
-    const V *numbers = at(s->rows[i].bound, &con->bound, con->place[k]);
+    IN numbers = at(s->rows[i].bound, &con->bound, con->place[k]);
     V c[MAX_ROWS], slope[MAX_ROWS], rho[MAX_ROWS];
     model_rows((int)i, x, u, numbers, con->shared, c);
     for (int j = 0; j < con->rows; j++) {
@@ -127,10 +128,10 @@ TGCO_APART V traced_terms(
     return total;
 }
 
-TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const V *u, V total, V *g, V *H) {
+TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, IN x, IN u, V total, OUT g, OUT H) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
-    const V *lam = rows->lam + con->place[k] * con->rows;
+    IN lam = rows->lam + con->place[k] * con->rows;
     if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) {
             int v = con->variable[j];
@@ -152,7 +153,7 @@ TGCO_INLINE V rows_terms(const Lanes *s, int64_t i, int64_t k, const V *x, const
 
 #if DIM > 0
 /* The vector from the guide's centre at knot k, and its squared length. */
-static inline V from_guide(const Lanes *s, int64_t k, const V *x, V *away) {
+static inline V from_guide(const Lanes *s, int64_t k, IN x, OUT away) {
     V square = SET(0.0);
     for (int a = 0; a < DIM; a++) {
         away[a] = x[POSITION + a] - s->center[k * DIM + a];
@@ -161,14 +162,14 @@ static inline V from_guide(const Lanes *s, int64_t k, const V *x, V *away) {
     return square;
 }
 
-static inline V guide_value(const Lanes *s, int64_t k, const V *x) {
+static inline V guide_value(const Lanes *s, int64_t k, IN x) {
     V away[DIM], half = SET(0.5), square = from_guide(s, k, x, away);
     if (s->of->guide == PATH) return half * s->weight * square;
     V f = square - s->radius[k] * s->radius[k];
     return tgco_if(f > SET(0.0), half * s->weight * f * f);
 }
 
-static inline void guide_expand(const Lanes *s, int64_t k, const V *x, V *g, V *H) {
+static inline void guide_expand(const Lanes *s, int64_t k, IN x, OUT g, OUT H) {
     V away[DIM], square = from_guide(s, k, x, away);
     if (s->of->guide == PATH) {
         for (int a = 0; a < DIM; a++) {
@@ -187,11 +188,11 @@ static inline void guide_expand(const Lanes *s, int64_t k, const V *x, V *g, V *
 #endif
 
 /* What constraints and guide add at knot k. u is NULL at the last knot. */
-static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+TGCO_LARGE V knot_value(const Lanes *s, int64_t k, IN x, IN u) {
     const Problem *p = s->of;
     V more = SET(0.0);
     for (int64_t i = 0; i < p->constraints; i++)
-        if (p->constraint[i].place[k] != NOWHERE) more = rows_terms(s, i, k, x, u, more, 0, 0);
+        if (p->constraint[i].place[k] != NOWHERE) more = rows_terms(s, i, k, x, u, more, NONE, NONE);
 #if DIM > 0
     if (p->guide != NO_GUIDE) more += guide_value(s, k, x);
 #endif
@@ -199,12 +200,12 @@ static V knot_value(const Lanes *s, int64_t k, const V *x, const V *u) {
 }
 
 /* L_M along X, U, and the cost in it. */
-static V merit_of(const Lanes *s, V *cost) {
+TGCO_LARGE V merit_of(const Lanes *s, V *cost) {
     int64_t N = s->of->N;
     V more = SET(0.0);
     *cost = SET(0.0);
     for (int64_t k = 0; k <= N; k++) {
-        const V *x = s->X + k * NX, *u = k < N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < N ? s->U + k * NU : 0;
         *cost += cost_value(s, k, x, u);
         more += knot_value(s, k, x, u);
     }
@@ -212,7 +213,7 @@ static V merit_of(const Lanes *s, V *cost) {
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of these terms. */
-static void knot_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+TGCO_LARGE void knot_expand(const Lanes *s, int64_t k, IN x, IN u, OUT g, OUT H) {
     const Problem *p = s->of;
     for (int64_t i = 0; i < p->constraints; i++)
         if (p->constraint[i].place[k] != NOWHERE) rows_terms(s, i, k, x, u, SET(0.0), g, H);

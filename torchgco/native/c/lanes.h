@@ -1,7 +1,8 @@
 /* Vectors V of LANES numbers of type REAL (double or float), one problem or sample per lane; lanes are never mixed. */
 #pragma once
 
-#include "vectors.h" /* or export/c/scalar.h */
+#include "vectors.h" /* or scalar/vectors.h */
+#include "pointers.h" /* or cuda/c/strided.h */
 
 #define SET(c) tgco_set(c)
 #define ADD(sum, a, b) ((sum) = tgco_fused((a), (b), (sum))) /* sum += a b */

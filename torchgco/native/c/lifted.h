@@ -4,10 +4,10 @@
 
 /* Up to `rounds` Gauss-Newton steps in states and controls together, where rollouts diverge (solvers/lifted.py). The
    first rollout that lowers L_M by the share `gain` replaces the iterate; `converged` says whether there was one. */
-static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, double gain) {
+TGCO_LARGE int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, double gain) {
     const Problem *p = s->of;
     int64_t N = p->N;
-    V *gap = aligned_alloc(sizeof(V), N * NX * sizeof(V));
+    Numbers gap = take_numbers(p, N * NX);
     if (!gap) return 0;
     for (int64_t first = 0; first < count; first += LANES) {
         int used = count - first < LANES ? (int)(count - first) : LANES;
@@ -17,9 +17,9 @@ static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, 
         for (int64_t round = 0; round < rounds && any(open); round++) {
             V linear, squares, lowest, cost, merit, sum = SET(0.0);
             gaps(s, gap);
-            backward(s, knot_expand, gap, &linear, &squares, &lowest);
+            backward(s, CALLED(knot_expand), gap, &linear, &squares, &lowest);
             if (round > 0) { /* the first gains are those that failed */
-                roll(s, knot_value, SET(1.0), SET(INFINITY), &cost, &merit);
+                roll(s, CALLED(knot_value), SET(1.0), SET(INFINITY), &cost, &merit);
                 I low = open & tgco_finite(merit) & (merit < s->merit - SET(gain) * tgco_fabs(s->merit));
                 for (int l = 0; l < used; l++) if (LANE(low, l)) {
                     int64_t e = s->element[l];
@@ -34,6 +34,6 @@ static int lift(Lanes *s, const int64_t *number, int64_t count, int64_t rounds, 
             open &= (lowest > SET(0.0)) & (sum == SET(0.0));
         }
     }
-    free(gap);
+    give(p, gap);
     return 1;
 }

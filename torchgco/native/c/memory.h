@@ -4,7 +4,7 @@
 
 static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
 
-static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t element) {
+static void fill(OUT to, const Array *from, int64_t knots, int lane, int64_t element) {
     if (!from->data) return;
     const double *source = from->data + element * from->element;
     int64_t count = from->knot ? knots : 1;
@@ -16,19 +16,19 @@ static void fill(V *to, const Array *from, int64_t knots, int lane, int64_t elem
 static inline int64_t numbers_of(const Problem *p, int64_t e) { return p->numbers ? p->numbers[e] : e; }
 
 /* The same of one knot. */
-static void fill_stage(V *to, const Array *from, int64_t k, int lane, int64_t element) {
+static void fill_stage(OUT to, const Array *from, int64_t k, int lane, int64_t element) {
     for (int64_t i = 0; i < from->size; i++) LANE(to[i], lane) = from->data[element * from->element + k * from->knot + i];
 }
 
 /* Memory that is laid out; without any, it is counted how much that takes. */
-typedef struct { V *memory; int64_t used; } Cut;
-static V *cut(Cut *from, int64_t count) {
-    V *part = from->memory ? from->memory + from->used : 0;
+typedef struct { Numbers memory; int64_t used; } Cut;
+static Numbers cut(Cut *from, int64_t count) {
+    Numbers part = from->memory ? from->memory + from->used : 0;
     from->used += count;
     return part;
 }
 
-static int64_t lay_out(Lanes *s, V *memory) {
+static int64_t lay_out(Lanes *s, Numbers memory) {
     const Problem *p = s->of;
     int64_t N = p->N;
     Cut m = {memory, 0};
@@ -46,9 +46,9 @@ static int64_t lay_out(Lanes *s, V *memory) {
         rows.lift = cut(&m, length(&c->lift, c->knots));
         if (c->balls > 0) {
             rows.widest = cut(&m, c->squares.size / c->balls);
-            rows.near = (int64_t *)cut(&m, c->rows / c->balls);
+            rows.near = (Places)cut(&m, c->rows / c->balls);
         }
-        rows.pushed = (I *)cut(&m, c->knots);
+        rows.pushed = (Truths)cut(&m, c->knots);
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
     }
@@ -61,8 +61,8 @@ static int start(Lanes *s, const Problem *p) {
     memset(s, 0, sizeof *s);
     s->of = p;
     int64_t count = lay_out(s, 0);
-    s->memory = take(p, (count + 1) * sizeof(V));
-    s->rows = take(p, (p->constraints + 1) * sizeof(Rows));
+    s->memory = take_numbers(p, count + 1);
+    s->rows = (Rows *)take(p, (p->constraints + 1) * sizeof(Rows));
     if (!s->memory || !s->rows) { finish(s); return 0; }
     lay_out(s, s->memory);
     return 1;
@@ -80,7 +80,7 @@ static void widen(const Rows *rows, const Constraint *c, int lane) {
 }
 
 /* Load problem e into a lane: first state, model, cost, and the numbers of its constraints. */
-static void enter_problem(Lanes *s, int lane, int64_t e) {
+TGCO_LARGE void enter_problem(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
     s->element[lane] = e;
@@ -102,7 +102,7 @@ static void enter_problem(Lanes *s, int lane, int64_t e) {
 }
 
 /* Load problem e with its iterate. */
-static void enter_iterate(Lanes *s, int lane, int64_t e) {
+TGCO_LARGE void enter_iterate(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
     enter_problem(s, lane, e);
@@ -111,7 +111,7 @@ static void enter_iterate(Lanes *s, int lane, int64_t e) {
 }
 
 /* Load problem e with its iterate, multipliers and guide. */
-static void enter(Lanes *s, int lane, int64_t e) {
+TGCO_LARGE void enter(Lanes *s, int lane, int64_t e) {
     const Problem *p = s->of;
     int64_t N = p->N;
     enter_iterate(s, lane, e);
@@ -140,7 +140,7 @@ static void enter(Lanes *s, int lane, int64_t e) {
     LANE(s->inner, lane) = p->inner ? p->inner[e] : 0; LANE(s->made, lane) = 0; s->rung[lane] = p->rung ? p->rung[e] : 0;
 }
 
-static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, int32_t refused, int32_t lost) {
+TGCO_LARGE void leave(const Lanes *s, int lane, int32_t status, int32_t converged, int32_t refused, int32_t lost) {
     const Problem *p = s->of;
     int64_t N = p->N, e = s->element[lane];
     for (int64_t i = 0; i < (N + 1) * NX; i++) p->X[e * (N + 1) * NX + i] = LANE(s->X[i], lane);
@@ -156,7 +156,7 @@ static void leave(const Lanes *s, int lane, int32_t status, int32_t converged, i
 typedef void Enter(Lanes *s, int lane, int64_t e);
 typedef void Put(Lanes *s, int64_t e, int used);
 
-static int put_all(const Problem *p, int64_t first, int64_t last, Enter *load, Put *put) {
+static int put_all(const Problem *p, int64_t first, int64_t last, CALLABLE(Enter) load, CALLABLE(Put) put) {
     Lanes lanes, *s = &lanes;
     if (!start(s, p)) return 0;
     for (int64_t e = first; e < last; e += LANES) {

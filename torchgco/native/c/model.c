@@ -2,12 +2,12 @@
 #include "model.h"
 #include "code.h"
 
-void model_step(const V *x, const V *u, const V *parameters, const double *w, V *next) {
+TGCO_BETWEEN_UNITS void model_step(IN x, IN u, IN parameters, const double *w, OUT next) {
     tgco_step(x, u, parameters, w, next);
 }
 
-void model_jacobian(const V *x, const V *u, const V *parameters, const double *w, V *f) {
+TGCO_BETWEEN_UNITS void model_jacobian(IN x, IN u, IN parameters, const double *w, OUT f) {
     tgco_jacobian(x, u, parameters, w, f);
 }
 
-void model_pull_back(const V *p, const V *f, V *g) { tgco_pull_back(p, f, g); }
+TGCO_BETWEEN_UNITS void model_pull_back(IN p, IN f, OUT g) { tgco_pull_back(p, f, g); }

@@ -4,10 +4,8 @@
    y = b + M' a, and there are their transposes T (h, k). Arrays over neurons have NET_SIZE(h) numbers, of which those
    from h on are of no account; tangents G are such arrays for each column. */
 #pragma once
-#include <stdint.h>
-#include <string.h>
 #include "functions.h"
-#include "wide.h" /* or export/c/wide_scalar.h */
+#include "wide.h" /* or scalar/wide.h */
 
 #define NET_SIZE(h) (((h) + 15) / 16 * 16) /* whole vectors of neurons or lanes, in single precision, too */
 

@@ -7,16 +7,19 @@
 
    q is a constant where these functions are called: their loops are short. */
 #pragma once
+#include <stddef.h>
 #include "functions.h"
 
 #define NEWTON_EPSILON (TGCO_IS_DOUBLE ? 0x1p-52 : 0x1p-23)
+#define NEWTON_BY_ROUNDING (TGCO_IS_DOUBLE ? 0x1.428a2f98d7294p-35 : 0x1.965fea53d6e3ap-16) /* to the power 2/3 */
 #define NEWTON_MOST 30 /* evaluations of the equations after the first */
 #define NEWTON_SERVES_AGAIN 0.1 /* as in base/roots.py */
+#define NEWTON_PIVOT 0.1 /* of a column's largest entry a pivot may be (Duff, Erisman and Reid, Direct Methods, 5.2) */
 
 typedef struct {
     V share, length; /* of the step that is tried, and its largest entry */
     I done, lost;
-    int evaluations;
+    int evaluations, turned; /* turned: whether F has exchanges */
 } newton_state;
 
 static inline newton_state newton_begin(int q, const V *trial, V *z, V *step) {
@@ -24,7 +27,7 @@ static inline newton_state newton_begin(int q, const V *trial, V *z, V *step) {
     s.share = SET(1.0);
     s.length = SET(INFINITY);
     s.done = s.lost = SET(0.0) != SET(0.0);
-    s.evaluations = 0;
+    s.evaluations = s.turned = 0;
     for (int i = 0; i < q; i++) z[i] = trial[i], step[i] = SET(0.0);
     return s;
 }
@@ -36,11 +39,15 @@ static inline void newton_exchange(I where, V *a, V *b) {
 }
 
 /* Elimination in place: unit upper U, and below it the factors of rows, with the inverses of the pivots on the diagonal.
-   turns (q, q): where row i was exchanged with row j, whose entry in column j was less; they differ between lanes. */
-TGCO_INLINE void newton_factor(int q, V *A, I *turns) {
+   turns (q, q): where row i was exchanged with row j, whose entry in column j was too small; they differ between lanes.
+   Returns whether any was: exchanges take longer than all else, and few matrices need them. */
+TGCO_INLINE int newton_factor(int q, V *A, I *turns) {
+    int turned = 0;
     for (int j = 0; j < q; j++) {
         for (int i = j + 1; i < q; i++) {
-            turns[j * q + i] = tgco_fabs(A[i * q + j]) > tgco_fabs(A[j * q + j]);
+            turns[j * q + i] = SET(NEWTON_PIVOT) * tgco_fabs(A[i * q + j]) > tgco_fabs(A[j * q + j]);
+            if (!tgco_any(turns[j * q + i])) continue;
+            turned = 1;
             for (int l = j; l < q; l++) newton_exchange(turns[j * q + i], &A[i * q + l], &A[j * q + l]);
         }
         V inverse = SET(1.0) / A[j * q + j];
@@ -49,12 +56,13 @@ TGCO_INLINE void newton_factor(int q, V *A, I *turns) {
         for (int i = j + 1; i < q; i++)
             for (int l = j + 1; l < q; l++) SUBTRACT(A[i * q + l], A[i * q + j], A[j * q + l]);
     }
+    return turned;
 }
 
-/* b = A^-1 b. */
+/* b = A^-1 b; turns: NULL where there were none. */
 TGCO_INLINE void newton_solve(int q, const V *A, const I *turns, V *b) {
     for (int j = 0; j < q; j++) {
-        for (int i = j + 1; i < q; i++) newton_exchange(turns[j * q + i], &b[i], &b[j]);
+        if (turns) for (int i = j + 1; i < q; i++) newton_exchange(turns[j * q + i], &b[i], &b[j]);
         b[j] = b[j] * A[j * q + j];
         for (int i = j + 1; i < q; i++) SUBTRACT(b[i], A[i * q + j], b[j]);
     }
@@ -67,7 +75,7 @@ TGCO_INLINE void newton_solve_turned(int q, const V *A, const I *turns, V *b) {
     for (int j = q - 1; j >= 0; j--) {
         for (int i = j + 1; i < q; i++) SUBTRACT(b[j], A[i * q + j], b[i]);
         b[j] = b[j] * A[j * q + j];
-        for (int i = q - 1; i > j; i--) newton_exchange(turns[j * q + i], &b[i], &b[j]);
+        if (turns) for (int i = q - 1; i > j; i--) newton_exchange(turns[j * q + i], &b[i], &b[j]);
     }
 }
 
@@ -88,7 +96,7 @@ TGCO_INLINE int newton_next(
         stale = better = left < SET(INFINITY);
         s->done = s->lost = NOT(better);
     } else {
-        newton_solve(q, F, F_turns, further);
+        newton_solve(q, F, s->turned ? F_turns : NULL, further);
         left = newton_largest(q, further);
         better = (left <= s->length) & NOT(s->done);
         ends = better & (left * left <= SET(NEWTON_EPSILON) * of_trial * s->length);
@@ -97,6 +105,7 @@ TGCO_INLINE int newton_next(
             z[i] = tgco_choose(better, ahead, z[i]);
         }
         s->share = tgco_choose(better, SET(1.0), SET(0.5) * s->share);
+        ends = ends | (NOT(better | s->done) & (s->length <= SET(NEWTON_BY_ROUNDING) * of_trial));
         s->done = s->done | ends;
         stale = better & NOT(ends) & (left > SET(NEWTON_SERVES_AGAIN) * s->length);
     }
@@ -105,12 +114,14 @@ TGCO_INLINE int newton_next(
         return 0;
     }
     if (tgco_any(stale)) {
-        newton_factor(q, A, turns);
+        int turned = newton_factor(q, A, turns);
+        if (turned && !s->turned) for (int i = 0; i < q * q; i++) F_turns[i] = s->lost & NOT(s->lost);
+        s->turned |= turned;
         for (int i = 0; i < q * q; i++) F[i] = tgco_choose(stale, A[i], F[i]);
-        for (int j = 0; j < q; j++) for (int i = j * q + j + 1; i < j * q + q; i++)
+        if (s->turned) for (int j = 0; j < q; j++) for (int i = j * q + j + 1; i < j * q + q; i++)
             F_turns[i] = (stale & turns[i]) | (NOT(stale) & F_turns[i]);
         for (int i = 0; i < q; i++) r[i] = -r[i];
-        newton_solve(q, F, F_turns, r);
+        newton_solve(q, F, s->turned ? F_turns : NULL, r);
         for (int i = 0; i < q; i++) further[i] = tgco_choose(stale, r[i], further[i]);
     }
     for (int i = 0; i < q; i++) {

@@ -3,14 +3,7 @@
 #pragma once
 #include "constants.h"
 #include "lanes.h"
-
-/* As many numbers of 32 bits, and numbers of other types that have the same values. */
-typedef uint32_t W __attribute__((vector_size(LANES * 4)));
-typedef int32_t Z __attribute__((vector_size(LANES * 4)));
-typedef float F __attribute__((vector_size(LANES * 4)));
-#define TGCO_CONVERTED(a, type) __builtin_convertvector(a, type)
-
-static inline F single(float c) { return c - (F){0}; }
+#include "words.h" /* or scalar/words.h */
 
 static inline W mixed(W z) {
     z ^= z >> 16;
@@ -27,13 +20,13 @@ static inline F uniform(W word) {
 
 /* sqrt(-2 log a) for a in (0, 1]: a = m 2^e with m in [sqrt(1/2), sqrt(2)), log m = 2 atanh((m - 1) / (m + 1)). */
 static inline F radius(F a) {
-    Z bits = (Z)a - 0x3f3504f3, e = bits >> 23;
-    F m = (F)((bits & 0x7fffff) + 0x3f3504f3), f = (m - single(1.0f)) / (m + single(1.0f)), s = f * f;
+    Z bits = BITS_OF(a) - 0x3f3504f3, e = bits >> 23;
+    F m = OF_BITS((bits & 0x7fffff) + 0x3f3504f3), f = (m - single(1.0f)) / (m + single(1.0f)), s = f * f;
     F series = single(1.0f / 9);
     for (int i = 7; i > 0; i -= 2) series = series * s + single(1.0f / i);
     F square = single(-2.0f) * (TGCO_CONVERTED(e, F) * single(0x1.62e43p-1f) + single(2.0f) * f * series),
       root;
-    for (int l = 0; l < LANES; l++) root[l] = sqrtf(square[l] > 0 ? square[l] : 0);
+    for (int l = 0; l < LANES; l++) LANE(root, l) = sqrtf(LANE(square, l) > 0 ? LANE(square, l) : 0);
     return root;
 }
 
@@ -48,22 +41,29 @@ static inline void turn(F a, F *cosine, F *sine) {
     }
     odd *= r;
     Z swapped = -(quarter & 1);
-    Z c = (swapped & (Z)odd) | (~swapped & (Z)even), d = (swapped & (Z)even) | (~swapped & (Z)odd);
-    *cosine = (F)(c ^ (((quarter + 1) & 2) << 30));
-    *sine = (F)(d ^ ((quarter & 2) << 30));
+    Z c = (swapped & BITS_OF(odd)) | (~swapped & BITS_OF(even)), d = (swapped & BITS_OF(even)) | (~swapped & BITS_OF(odd));
+    *cosine = OF_BITS(c ^ (((quarter + 1) & 2) << 30));
+    *sine = OF_BITS(d ^ ((quarter & 2) << 30));
+}
+
+/* The pair of draws of a number of each lane. */
+static inline void pair(uint64_t key, W number, F *cosine, F *sine) {
+    W word = mixed((number * WEYL) ^ (uint32_t)key);
+    F length = radius(uniform(word)), c, s;
+    turn(uniform(mixed(word ^ (uint32_t)(key >> 32))), &c, &s);
+    *cosine = length * c;
+    *sine = length * s;
 }
 
 /* Draws z (rows) of the samples first, first + 1, ..., one to a lane. */
 static void normal(uint64_t key, int64_t first, int64_t rows, V *z) {
     int64_t half = (rows + 1) / 2;
-    uint32_t low = (uint32_t)key, high = (uint32_t)(key >> 32);
     W number;
-    for (int l = 0; l < LANES; l++) number[l] = (uint32_t)(first + l) * (uint32_t)half;
+    for (int l = 0; l < LANES; l++) LANE(number, l) = (uint32_t)(first + l) * (uint32_t)half;
     for (int64_t i = 0; i < half; i++) {
-        W word = mixed(((number + (uint32_t)i) * WEYL) ^ low);
-        F length = radius(uniform(word)), cosine, sine;
-        turn(uniform(mixed(word ^ high)), &cosine, &sine);
-        z[i] = TGCO_CONVERTED(length * cosine, V);
-        if (i + half < rows) z[i + half] = TGCO_CONVERTED(length * sine, V);
+        F cosine, sine;
+        pair(key, number + (uint32_t)i, &cosine, &sine);
+        z[i] = TGCO_CONVERTED(cosine, V);
+        if (i + half < rows) z[i + half] = TGCO_CONVERTED(sine, V);
     }
 }

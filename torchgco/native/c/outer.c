@@ -1,6 +1,5 @@
 /* The outer loop of the augmented Lagrangian (Algorithm 1): inner solves of all problems, then multipliers, penalties
    and the tests of the end, until each has ended. solvers/augmented_lagrangian.py does the same in PyTorch. */
-#include <float.h>
 #include "lifted.h"
 #include "sweep.h"
 
@@ -24,7 +23,7 @@ static int preferred(const Outer *o, int64_t e, double violation) {
     return fits ? !did || cost < o->best_cost[e] : !did && violation < before;
 }
 
-static void keep(const Outer *o, int64_t e, double violation) {
+TGCO_LARGE void keep(const Outer *o, int64_t e, double violation) {
     const Problem *p = o->of;
     int64_t N = p->N;
     memcpy(o->best_X + e * (N + 1) * NX, p->X + e * (N + 1) * NX, (N + 1) * NX * sizeof(double));
@@ -51,7 +50,7 @@ static int64_t tested(const Outer *o, int64_t e, double violation, int caught) {
 
 /* Multipliers, penalty, best iterate and the tests of the end of up to LANES problems; then L_M of the next inner solve.
    A problem that has failed only gets its violation. */
-static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int count, int failed) {
+TGCO_LARGE void outer_update(Lanes *s, const Outer *o, const int64_t *number, int count, int failed) {
     const Problem *p = s->of;
     V least, total;
     I caught;
@@ -73,7 +72,7 @@ static void outer_update(Lanes *s, const Outer *o, const int64_t *number, int co
             const Constraint *c = p->constraint + i;
             double *lam = c->lam + e * c->knots * c->rows;
             for (int64_t k = 0; k < c->knots; k++, lam += c->rows) {
-                const V *next = s->rows[i].lam + k * c->rows;
+                IN next = s->rows[i].lam + k * c->rows;
                 if (LANE(s->rows[i].pushed[k], l)) for (int j = 0; j < c->rows; j++) lam[j] = LANE(next[j], l);
                 else memset(lam, 0, c->rows * sizeof *lam);
             }
@@ -135,7 +134,7 @@ static void update_all(Lanes *s, const Outer *o, const int64_t *running, int64_t
 int tgco_outer(const Outer *o, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
     Problem problem = *o->of;
-    int64_t *running = in_order(first, last), *some = in_order(first, last);
+    int64_t *running = in_order(o->of, first, last), *some = in_order(o->of, first, last);
     int begun = running && some && start(s, &problem), done = begun;
     for (int64_t pass = 0; done && pass < o->passes; pass++) {
         int64_t count = 0;
@@ -147,6 +146,6 @@ int tgco_outer(const Outer *o, int64_t first, int64_t last) {
         if (o->updates && done) update_all(s, o, running, count, some);
     }
     if (begun) finish(s);
-    free(running); free(some);
+    give(o->of, some); give(o->of, running);
     return done;
 }

@@ -6,13 +6,13 @@
 
 /* The forward pass (line 16) from the nominal X, U along G with step lengths alpha; writes Xn, Un, J_var and L_M. It ends
    early, with what has added up so far, where that is over `enough` in all lanes, or isn't a number. */
-void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
+TGCO_BETWEEN_UNITS void roll(Lanes *s, CALLABLE(Value) value, V alpha, V enough, V *cost, V *merit) {
     const Problem *p = s->of;
     V total = SET(0.0), more = SET(0.0);
     memcpy(s->Xn, s->X, NX * sizeof(V));
     for (int64_t k = 0; k < p->N; k++) {
-        const V *X = s->X + k * NX, *G = s->G + k * NU * NZ;
-        V *x = s->Xn + k * NX, *u = s->Un + k * NU, dx[NX];
+        IN X = s->X + k * NX; IN G = s->G + k * NU * NZ;
+        OUT x = s->Xn + k * NX; OUT u = s->Un + k * NU; V dx[NX];
         for (int i = 0; i < NX; i++) dx[i] = x[i] - X[i];
         for (int j = 0; j < NU; j++) {
             V step = alpha * G[j * NZ + NX];
@@ -24,29 +24,29 @@ void roll(Lanes *s, Value *value, V alpha, V enough, V *cost, V *merit) {
         if (!any(total + more <= enough)) { *cost = total; *merit = total + more; return; }
         model_step(x, u, model_at(s, k), s->of->shared, x + NX);
     }
-    total += cost_value(s, p->N, s->Xn + p->N * NX, 0);
-    more += value(s, p->N, s->Xn + p->N * NX, 0);
+    total += cost_value(s, p->N, s->Xn + p->N * NX, NONE);
+    more += value(s, p->N, s->Xn + p->N * NX, NONE);
     *cost = total;
     *merit = total + more;
 }
 
 /* The backward pass (lines 4-13): gains into G, the two sums of the expected change, and the smallest pivot. `gap`
    (N, NX) is how far each step ends from the knot after it, NULL along a rollout. */
-void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *lowest) {
+TGCO_BETWEEN_UNITS void backward(Lanes *s, CALLABLE(Expand) expand, IN gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
     V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ], pivots[NU];
     V sum = SET(0.0), square = SET(0.0), least = SET(INFINITY);
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-    cost_expand(s, p->N, s->X + p->N * NX, 0, g, H);
-    expand(s, p->N, s->X + p->N * NX, 0, g, H);
+    cost_expand(s, p->N, s->X + p->N * NX, NONE, g, H);
+    expand(s, p->N, s->X + p->N * NX, NONE, g, H);
     for (int i = 0; i < NX; i++) {
         vector[i] = g[i];
         for (int j = 0; j < NX; j++) P[i * NX + j] = i <= j ? H[i * S + j] : H[j * S + i];
     }
     for (int64_t k = p->N - 1; k >= 0; k--) {
-        const V *x = s->X + k * NX, *u = s->U + k * NU;
-        V *G = s->G + k * NU * NZ;
+        IN x = s->X + k * NX; IN u = s->U + k * NU;
+        OUT G = s->G + k * NU * NZ;
         tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         tgco_gather(P, f, T);
         tgco_product(f, T, H);
@@ -87,11 +87,11 @@ void backward(Lanes *s, Expand *expand, const V *gap, V *linear, V *squares, V *
 }
 
 /* Whether everything that the backward pass reads is finite. */
-I is_finite(const Lanes *s, Expand *expand) {
+TGCO_BETWEEN_UNITS I is_finite(const Lanes *s, CALLABLE(Expand) expand) {
     const Problem *p = s->of;
     V g[S], H[S * S], f[NJ ? NJ : 1], sum = SET(0.0);
     for (int64_t k = 0; k <= p->N; k++) {
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < p->N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
         cost_expand(s, k, x, u, g, H);
         expand(s, k, x, u, g, H);
@@ -105,7 +105,7 @@ I is_finite(const Lanes *s, Expand *expand) {
 }
 
 /* How far each step ends from the knot after it. */
-void gaps(const Lanes *s, V *gap) {
+TGCO_BETWEEN_UNITS void gaps(const Lanes *s, OUT gap) {
     for (int64_t k = 0; k < s->of->N; k++) {
         V next[NX];
         model_step(s->X + k * NX, s->U + k * NU, model_at(s, k), s->of->shared, next);
@@ -114,13 +114,13 @@ void gaps(const Lanes *s, V *gap) {
 }
 
 /* A full step of the linearised dynamics under the gains, which closes the gaps; added to X and U. */
-void linear_step(Lanes *s, const V *gap) {
+TGCO_BETWEEN_UNITS void linear_step(Lanes *s, IN gap) {
     V one[NX * NX], F[NX * S], f[NJ ? NJ : 1], z[S], dx[NX];
     for (int i = 0; i < NX * NX; i++) one[i] = SET(i % (NX + 1) == 0);
     for (int i = 0; i < NX; i++) dx[i] = SET(0.0);
     for (int64_t k = 0; k < s->of->N; k++) {
-        V *x = s->X + k * NX, *u = s->U + k * NU;
-        const V *G = s->G + k * NU * NZ;
+        OUT x = s->X + k * NX; OUT u = s->U + k * NU;
+        IN G = s->G + k * NU * NZ;
         tgco_jacobian(x, u, model_at(s, k), s->of->shared, f);
         tgco_gather(one, f, F);
         memcpy(z, dx, sizeof dx);

@@ -32,7 +32,7 @@ static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
 }
 
 /* Adds the derivatives of the term of a row c with its slopes by position. */
-static inline void add_slopes(const Lanes *s, V c, V lam, const V *slopes, V *g, V *H) {
+static inline void add_slopes(const Lanes *s, V c, V lam, IN slopes, OUT g, OUT H) {
     V rho, slope = pull(s, 0, c, lam, &rho);
     for (int a = 0; a < DIM; a++) {
         ADD(g[POSITION + a], slope, slopes[a]);

@@ -6,8 +6,6 @@
    are Python's text (native/codegen/source.py): constants.h, and code.h with the functions of a model, its cost and its
    traced constraints. `editor` has one of each, and compile_flags.txt the sizes, with which every file compiles alone. */
 #pragma once
-#include <stdlib.h>
-#include <string.h>
 #include "functions.h"
 #include "structures.h"
 
@@ -16,22 +14,22 @@
 
 /* A constraint's multipliers and numbers. */
 typedef struct {
-    V *lam, *bound, *squares, *velocities, *radii, *stops, *lift;
-    V *widest; /* of a body among spheres: the largest inflated radius of each, ABSENT without one */
-    int64_t *near; /* room for the numbers of those that a ball may touch */
-    I *pushed; /* (knots): whether any multiplier of the knot isn't zero */
+    Numbers lam, bound, squares, velocities, radii, stops, lift;
+    Numbers widest; /* of a body among spheres: the largest inflated radius of each, ABSENT without one */
+    Places near; /* room for the numbers of those that a ball may touch */
+    Truths pushed; /* (knots): whether any multiplier of the knot isn't zero */
     const float *map[LANES]; /* of a FIELD: each lane's map */
 } Rows;
 
 /* The working data of a group of lanes. */
 typedef struct {
     const Problem *of;
-    V *X, *U, *Xn, *Un, *G, *parameters, *cost_data[COST_ARRAYS], *center, *radius;
+    Numbers X, U, Xn, Un, G, parameters, cost_data[COST_ARRAYS], center, radius;
     Rows *rows;
     V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
     V floor; /* the constraints' terms add no less than minus this to L_M: lam^2 / (2 mu) for each row */
     int64_t element[LANES], rung[LANES]; /* at which the next line search begins */
-    V *memory;
+    Numbers memory;
 } Lanes;
 
 /* Bits of the kinds of rows that there may be; where a text serves one problem, of its own alone. */
@@ -46,14 +44,14 @@ static inline int is_solid(const Constraint *con) {
 static inline int any(I where) { return tgco_any(where); }
 static inline I tgco_finite(V a) { return (a - a) == SET(0.0); }
 
-static inline const V *at(const V *array, const Array *shape, int64_t k) {
+static inline ConstNumbers at(ConstNumbers array, const Array *shape, int64_t k) {
     return array + (shape->knot ? k * shape->size : 0);
 }
 
 /* Array i of the cost at knot k. */
-static inline const V *cost_at(const Lanes *s, int i, int64_t k) {
+static inline ConstNumbers cost_at(const Lanes *s, int i, int64_t k) {
     return at(s->cost_data[i], s->of->cost_data + i, k);
 }
 
 /* The model's own numbers at stage k. */
-static inline const V *model_at(const Lanes *s, int64_t k) { return at(s->parameters, &s->of->parameters, k); }
+static inline ConstNumbers model_at(const Lanes *s, int64_t k) { return at(s->parameters, &s->of->parameters, k); }

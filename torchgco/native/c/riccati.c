@@ -5,7 +5,7 @@
 
 /* The factor of the cost-to-go's curvature in the free components of the start, and the unit matrix in the others. */
 static I factor_start(Barrier *t) {
-    V *L = t->L_start, one = SET(1.0);
+    OUT L = t->L_start; V one = SET(1.0);
     I good = one == one;
     for (int j = 0; j < NX; j++) {
         I own = tgco_is(t->is_free[j]);
@@ -26,18 +26,18 @@ static I factor_start(Barrier *t) {
 /* Factors L and gains K of the recursion with `shift` on the diagonal; where it isn't positive definite, the answer is
    false. It stops as soon as it is false for all lanes of `open`, unless there are none: what it says of others then
    is void. */
-I factor(Barrier *t, I open) {
+TGCO_BETWEEN_UNITS I factor(Barrier *t, I open) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
     V T[S * NX], Q[S * S], Y[NU * NX], pivots[NU];
     I good = SET(0.0) == SET(0.0);
     int stops = any(open);
-    const V *last = t->H + N * S * S;
+    IN last = t->H + N * S * S;
     for (int i = 0; i < NX; i++) for (int j = i; j < NX; j++)
         t->P[(N * NX + i) * NX + j] = t->P[(N * NX + j) * NX + i] = last[i * S + j] + (i == j ? t->shift : SET(0.0));
     for (int64_t k = N - 1; k >= 0; k--) {
-        const V *H = t->H + k * S * S, *f = t->f + k * NJ;
-        V *L = t->L + k * NU * NU, *K = s->G + k * NU * NZ, *P = t->P + k * NX * NX;
+        IN H = t->H + k * S * S; IN f = t->f + k * NJ;
+        OUT L = t->L + k * NU * NU; OUT K = s->G + k * NU * NZ; OUT P = t->P + k * NX * NX;
         tgco_gather(P + NX * NX, f, T);
         tgco_product(f, T, Q);
         for (int i = 0; i < S; i++) for (int j = i; j < S; j++) Q[i * S + j] += H[i * S + j];
@@ -63,8 +63,8 @@ I factor(Barrier *t, I open) {
 
 /* The step of the start that is the least of the quadratic cost-to-go. */
 static void solve_start(Barrier *t) {
-    const V *L = t->L_start;
-    V *d = t->dx;
+    IN L = t->L_start;
+    OUT d = t->dx;
     for (int i = 0; i < NX; i++) {
         d[i] = tgco_if(tgco_is(t->is_free[i]), -t->p[i]);
         for (int a = 0; a < i; a++) SUBTRACT(d[i], L[i * NX + a], d[a]);
@@ -77,14 +77,14 @@ static void solve_start(Barrier *t) {
 }
 
 /* The step in states, controls and costates that the factors give. */
-void solve(Barrier *t) {
+TGCO_BETWEEN_UNITS void solve(Barrier *t) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
     V q[S], z[S], along_f[NX];
     for (int i = 0; i < NX; i++) t->p[N * NX + i] = t->g[1][N * S + i] + t->mu * t->g[2][N * S + i];
     for (int64_t k = N - 1; k >= 0; k--) {
-        const V *P = t->P + (k + 1) * NX * NX, *next = t->p + (k + 1) * NX, *L = t->L + k * NU * NU;
-        V *K = s->G + k * NU * NZ, v[NX];
+        IN P = t->P + (k + 1) * NX * NX; IN next = t->p + (k + 1) * NX; IN L = t->L + k * NU * NU;
+        OUT K = s->G + k * NU * NZ; V v[NX];
         for (int i = 0; i < NX; i++) {
             v[i] = next[i];
             for (int j = 0; j < NX; j++) ADD(v[i], P[i * NX + j], t->aim[k * NX + j]);
@@ -105,8 +105,8 @@ void solve(Barrier *t) {
     for (int i = 0; i < NX; i++) t->dx[i] = SET(0.0);
     if (t->is_free) solve_start(t);
     for (int64_t k = 0; k < N; k++) {
-        const V *K = s->G + k * NU * NZ, *P = t->P + (k + 1) * NX * NX;
-        V *dx = t->dx + k * NX, *du = t->du + k * NU;
+        IN K = s->G + k * NU * NZ; IN P = t->P + (k + 1) * NX * NX;
+        OUT dx = t->dx + k * NX; OUT du = t->du + k * NU;
         for (int i = 0; i < NX; i++) z[i] = dx[i];
         for (int j = 0; j < NU; j++) {
             du[j] = K[j * NZ + NX];

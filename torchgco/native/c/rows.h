@@ -5,7 +5,7 @@
 #define BLOCK 32 /* spheres evaluated together: most blocks are far away and add nothing */
 
 /* Row j of bounds at knot k. */
-static inline V bound(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, const V *u) {
+static inline V bound(const Constraint *con, const Rows *rows, int64_t j, int64_t k, IN x, IN u) {
     int v = con->variable[j];
     return SET(con->sign[j]) * ((v < NX ? x[v] : u[v - NX]) - at(rows->bound, &con->bound, con->place[k])[j]);
 }
@@ -18,8 +18,8 @@ static inline V square_at(const Constraint *con, const Rows *rows, int64_t j, in
 }
 
 /* Row j of spheres at knot k, and the vector from the centre to the position (DIM); an absent sphere is c = -1. */
-static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, const V *x, V *away) {
-    const V *o = at(rows->bound, &con->bound, con->place[k]) + j * DIM;
+static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64_t k, IN x, OUT away) {
+    IN o = at(rows->bound, &con->bound, con->place[k]) + j * DIM;
     V square = SET(0.0), limit = square_at(con, rows, j, k);
     I here = limit >= SET(0.0);
     for (int a = 0; a < DIM; a++) {
@@ -33,7 +33,7 @@ static inline V sphere(const Constraint *con, const Rows *rows, int64_t j, int64
 
 /* Rows c of the spheres first, ..., last - 1 at knot k, and whether they add anything in any lane. */
 static inline int spheres(
-    const Constraint *con, const Rows *rows, int64_t first, int64_t last, int64_t k, const V *x, V *c) {
+    const Constraint *con, const Rows *rows, int64_t first, int64_t last, int64_t k, IN x, OUT c) {
     I matters = rows->pushed[con->place[k]];
     for (int64_t j = first; j < last; j++) {
         V away[DIM];

@@ -1,7 +1,7 @@
 /* What Python hands to the library and reads back: Python's own declarations follow from these (native/structures.py).
    E counts problems, S = NX + NU, NZ = NX + 1. Sizes of arrays stand in brackets, (E, ...). */
 #pragma once
-#include <stdint.h>
+#include "standard.h"
 #include "constants.h" /* enumerations and numbers that Python has, too */
 
 /* An array over (problems, knots, numbers); a stride of 0 stands for an axis of length 1. */

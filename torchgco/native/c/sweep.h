@@ -11,7 +11,7 @@ typedef struct {
 } Sweep;
 
 /* One row: its value c, by how much it is violated, and its multiplier. */
-static inline void note(const Lanes *s, const Constraint *con, V c, V violated, V *lam, I *pushed, Sweep *sweep) {
+static inline void note(const Lanes *s, const Constraint *con, V c, V violated, OUT lam, I *pushed, Sweep *sweep) {
     V zero = SET(0.0), worst = sweep->violation;
     sweep->violation = tgco_choose((violated > worst) | (violated != violated), violated, worst); /* NaN stays */
     sweep->touched += tgco_truth(c > zero);
@@ -31,9 +31,9 @@ static inline V past_radius(V c, V radius) {
 #if DIM > 0
 /* Rows of obstacles at one knot. */
 static inline void note_solids(
-    Lanes *s, const Constraint *con, const Rows *rows, int64_t k, const V *x, I *pushed, Sweep *sweep) {
+    Lanes *s, const Constraint *con, const Rows *rows, int64_t k, IN x, I *pushed, Sweep *sweep) {
     int64_t place = con->place[k];
-    V *lam = rows->lam + place * con->rows, zero = SET(0.0);
+    OUT lam = rows->lam + place * con->rows; V zero = SET(0.0);
     if (is_kind(con, SPHERES)) {
         V c[BLOCK];
         for (int64_t first = 0; first < con->rows; first += BLOCK) {
@@ -46,30 +46,30 @@ static inline void note_solids(
             }
         }
     } else if (is_kind(con, BOXES)) {
-        const V *factors = rows->bound + con->rows * 2 * DIM;
+        IN factors = rows->bound + con->rows * 2 * DIM;
         int known = any(rows->pushed[place]);
         for (int64_t first = 0, last; first < con->rows; first = last) {
             last = first + TOGETHER < con->rows ? first + TOGETHER : con->rows;
             if (!some_matter(con, rows, lam, known, first, last, x)) continue;
             for (int64_t j = first; j < last; j++) {
                 if (!may_matter(con, rows, lam, known, j, x)) continue;
-                V c = solid(con, rows, j, k, x, 0);
+                V c = solid(con, rows, j, k, x, NONE);
                 note(s, con, c, tgco_choose(c <= zero, zero, c / factors[j]), lam + j, pushed, sweep);
             }
         }
     } else if (is_kind(con, FIELD) && (any(rows->pushed[place]) || !is_far_from_map(con, rows, x))) {
-        V c = field_row(con, rows, k, x, 0, 0);
+        V c = field_row(con, rows, k, x, NONE, NONE);
         note(s, con, c, tgco_choose(c <= zero, zero, depth_of(rows, c)), lam, pushed, sweep);
     }
 }
 #endif
 
 /* Rows of one knot of a constraint. */
-static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sweep *sweep) {
+TGCO_LARGE void note_rows(Lanes *s, int64_t i, int64_t k, IN x, IN u, Sweep *sweep) {
     const Constraint *con = s->of->constraint + i;
     const Rows *rows = s->rows + i;
     int64_t place = con->place[k];
-    V *lam = rows->lam + place * con->rows, zero = SET(0.0);
+    OUT lam = rows->lam + place * con->rows; V zero = SET(0.0);
     I none = zero != zero, pushed = none;
     if (is_kind(con, BOUNDS)) {
         for (int j = 0; j < con->rows; j++) {
@@ -102,7 +102,7 @@ static void note_rows(Lanes *s, int64_t i, int64_t k, const V *x, const V *u, Sw
 
 /* What a sweep over the iterates finds, of all rows or of obstacles alone, and whether one is caught: `least` rows of
    obstacles or more in contact at a knot, start and end left out. */
-static Sweep swept(Lanes *s, int obstacles, int update, V least, I *caught) {
+TGCO_LARGE Sweep swept(Lanes *s, int obstacles, int update, V least, I *caught) {
     int64_t N = s->of->N;
     V zero = SET(0.0);
     Sweep sweep = {zero, zero, zero, update};

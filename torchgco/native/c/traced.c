@@ -9,21 +9,21 @@
 #include "code.h"
 
 /* The cost of stage k at x, u; of the last knot where u is NULL. */
-V cost_value(const Lanes *s, int64_t k, const V *x, const V *u) {
+TGCO_BETWEEN_UNITS V cost_value(const Lanes *s, int64_t k, IN x, IN u) {
     V value;
-    const V *scale = cost_at(s, FACTOR, k);
+    IN scale = cost_at(s, FACTOR, k);
     if (u) tgco_stage_value(x, u, cost_at(s, STAGE, k), s->of->stage_shared, &value);
     else tgco_last_value(x, u, cost_at(s, LAST, k), s->of->last_shared, &value);
     return u ? scale[0] * value - scale[1] : scale[0] * value;
 }
 
-static inline void add_entries(V factor, int slopes, int count, const int *places, const V *e, V *g, V *H) {
+static inline void add_entries(V factor, int slopes, int count, const int *places, IN e, OUT g, OUT H) {
     for (int i = 0; i < slopes; i++) ADD(g[places[i]], factor, e[i]);
     for (int i = slopes; i < count; i++) ADD(H[places[i]], factor, e[i]);
 }
 
 /* Adds gradient g (S) and upper triangle H (S, S) of `cost_value`. */
-void cost_expand(const Lanes *s, int64_t k, const V *x, const V *u, V *g, V *H) {
+TGCO_BETWEEN_UNITS void cost_expand(const Lanes *s, int64_t k, IN x, IN u, OUT g, OUT H) {
     if (u) {
         V e[STAGE_ENTRIES + 1];
         tgco_stage_entries(x, u, cost_at(s, STAGE, k), s->of->stage_shared, e);

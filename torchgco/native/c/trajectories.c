@@ -11,7 +11,9 @@ static void put_values(Lanes *s, int64_t e, int used) {
         s->of->merit[e + l] = LANE(merit, l);
     }
 }
-int tgco_value(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_values); }
+int tgco_value(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_values));
+}
 
 /* Rollout of U from the first knot of X. */
 int tgco_open_loop(const Problem *p, int64_t first, int64_t last) { return roll_out(p, first, last, 0); }
@@ -30,7 +32,7 @@ static void put_expansion(Lanes *s, int64_t e, int used) {
     for (int64_t k = 0; k <= p->N; k++) {
         V g[S], H[S * S];
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
-        const V *x = s->X + k * NX, *u = k < p->N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < p->N ? s->U + k * NU : 0;
         cost_expand(s, k, x, u, g, H);
         knot_expand(s, k, x, u, g, H);
         for (int l = 0; l < used; l++) {
@@ -40,15 +42,25 @@ static void put_expansion(Lanes *s, int64_t e, int used) {
         }
     }
 }
-int tgco_expand(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_expansion); }
+int tgco_expand(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_expansion));
+}
+
+/* How many numbers of a lane these functions and tgco_outer have room for. */
+int64_t tgco_solver_room(const Problem *p) {
+    Lanes lanes, *s = &lanes;
+    memset(s, 0, sizeof *s);
+    s->of = p;
+    return lay_out(s, 0) + 1 + p->N * NX; /* with the gaps of `lift` */
+}
 
 /* Up to `limit` iterations of inner solves. */
 int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
-    int64_t *number = in_order(first, last);
-    if (!number || !start(s, p)) { free(number); return 0; }
+    int64_t *number = in_order(p, first, last);
+    if (!number || !start(s, p)) { give(p, number); return 0; }
     inner_solves(s, number, last - first);
-    free(number);
+    give(p, number);
     finish(s);
     return 1;
 }
@@ -56,8 +68,8 @@ int tgco_ilqr(const Problem *p, int64_t first, int64_t last) {
 /* The same from the rollout of U, where that is finite. */
 int tgco_descend(const Problem *p, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
-    int64_t size = (p->N + 1) * NX, count = 0, *number = in_order(first, last);
-    if (!number || !tgco_begin(p, first, last) || !start(s, p)) { free(number); return 0; }
+    int64_t size = (p->N + 1) * NX, count = 0, *number = in_order(p, first, last);
+    if (!number || !tgco_begin(p, first, last) || !start(s, p)) { give(p, number); return 0; }
     for (int64_t e = first; e < last; e++) {
         double sum = 0 * p->merit[e];
         for (int64_t i = 0; i < size; i++) sum += 0 * p->X[e * size + i];
@@ -65,7 +77,7 @@ int tgco_descend(const Problem *p, int64_t first, int64_t last) {
         else p->status[e] = NON_FINITE;
     }
     if (count) inner_solves(s, number, count);
-    free(number);
+    give(p, number);
     finish(s);
     return 1;
 }
@@ -73,10 +85,10 @@ int tgco_descend(const Problem *p, int64_t first, int64_t last) {
 /* `lift` of problems first, ..., last - 1. */
 int tgco_lift(const Problem *p, int64_t first, int64_t last) {
     Lanes lanes, *s = &lanes;
-    int64_t *number = in_order(first, last);
-    if (!number || !start(s, p)) { free(number); return 0; }
+    int64_t *number = in_order(p, first, last);
+    if (!number || !start(s, p)) { give(p, number); return 0; }
     int done = lift(s, number, last - first, p->limit, p->gain);
-    free(number);
+    give(p, number);
     finish(s);
     return done;
 }

@@ -1,8 +1,7 @@
-/* Vectors V of LANES numbers of type REAL, and what truth of their lanes is, I. export/c/scalar.h has
+/* Vectors V of LANES numbers of type REAL, and what truth of their lanes is, I. scalar/vectors.h has
    the same for a single lane. */
 #pragma once
-#include <math.h>
-#include <stdint.h>
+#include "standard.h"
 #include "real.h"
 
 /* The function of the C library for REAL: sin or sinf. */
@@ -15,7 +14,8 @@ typedef __typeof__((V){0} == (V){0}) I; /* all bits of a lane set where true */
 
 #define TGCO_INLINE static inline __attribute__((always_inline))
 #define TGCO_APART static __attribute__((noinline))
-#define TGCO_BETWEEN_UNITS __attribute__((visibility("hidden"))) /* declares what one unit offers the others */
+#define TGCO_BETWEEN_UNITS __attribute__((visibility("hidden"))) /* of what one unit offers the others */
+#define TGCO_LARGE static /* of functions that a GPU's compiler leaves whole */
 
 static inline V tgco_set(double c) { return (REAL)c - (V){0}; } /* minus, so that -0.0 keeps its sign */
 

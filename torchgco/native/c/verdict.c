@@ -1,6 +1,5 @@
 /* What returned trajectories are judged by: violations, clearance, gains and what a step could still save, costates, and the
    rollouts that solves stand for. Functions return 0 without memory. */
-#include <float.h>
 #include "lifted.h"
 #include "sweep.h"
 
@@ -11,7 +10,7 @@ static void put_violation(Lanes *s, int64_t e, int used) {
     for (int l = 0; l < used; l++) s->of->merit[e + l] = LANE(violation, l);
 }
 int tgco_violation(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_iterate, put_violation);
+    return put_all(p, first, last, CALLED(enter_iterate), CALLED(put_violation));
 }
 
 /* The same of rows of obstacles alone. */
@@ -21,11 +20,11 @@ static void put_penetration(Lanes *s, int64_t e, int used) {
     for (int l = 0; l < used; l++) s->of->merit[e + l] = LANE(violation, l);
 }
 int tgco_penetration(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_iterate, put_penetration);
+    return put_all(p, first, last, CALLED(enter_iterate), CALLED(put_penetration));
 }
 
 /* Whether slightly other controls lead to other states than rounding would. */
-static I is_sensitive(const Lanes *s) {
+TGCO_LARGE I is_sensitive(const Lanes *s) {
     const Problem *p = s->of;
     V largest[NU], x[2 * NX], u[NU], apart = SET(0.0), size = SET(0.0);
     for (int j = 0; j < NU; j++) largest[j] = SET(0.0);
@@ -52,7 +51,7 @@ static void put_gains(Lanes *s, int64_t e, int used) {
     Sweep sweep = {SET(0.0), SET(0.0), SET(0.0), 0};
     if (p->sensitive) sensitive = is_sensitive(s);
     if (p->slack) sweep = swept(s, 0, 0, SET(0.0), &caught);
-    backward(s, knot_expand, NULL, &linear, &squares, &lowest);
+    backward(s, CALLED(knot_expand), NONE, &linear, &squares, &lowest);
     V quadratic = -linear - s->mu_r * squares;
     for (int l = 0; l < used; l++) {
         p->cost[e + l] = LANE(linear, l);
@@ -63,7 +62,9 @@ static void put_gains(Lanes *s, int64_t e, int used) {
         for (int64_t i = 0; i < size; i++) p->gains[(e + l) * size + i] = LANE(s->G[i], l);
     }
 }
-int tgco_gains(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_gains); }
+int tgco_gains(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_gains));
+}
 
 /* Costates along given trajectories, (E, N+1, NX), by which J_var + lam'c is stationary in the states; into `slopes`. */
 static void put_costates(Lanes *s, int64_t e, int used) {
@@ -71,7 +72,7 @@ static void put_costates(Lanes *s, int64_t e, int used) {
     int64_t N = p->N;
     V y[NX], g[S], H[S * S], f[NJ ? NJ : 1];
     for (int64_t k = N; k > 0; k--) {
-        const V *x = s->X + k * NX, *u = k < N ? s->U + k * NU : 0;
+        IN x = s->X + k * NX; IN u = k < N ? s->U + k * NU : 0;
         memset(g, 0, sizeof g); memset(H, 0, sizeof H);
         if (k < N) {
             model_jacobian(x, u, model_at(s, k), p->shared, f);
@@ -84,7 +85,9 @@ static void put_costates(Lanes *s, int64_t e, int used) {
             for (int i = 0; i < NX; i++) p->slopes[((e + l) * (N + 1) + k) * NX + i] = LANE(y[i], l);
     }
 }
-int tgco_costates(const Problem *p, int64_t first, int64_t last) { return put_all(p, first, last, enter, put_costates); }
+int tgco_costates(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_costates));
+}
 
 /* What the states and controls of a solve stand for: the rollout U + K (x - X) from the first knot of X, in place, by
    finite gains (E, N, NU, NZ), of which K is used; or that of U alone, where it is X up to rounding and the first isn't.
@@ -102,12 +105,12 @@ static I is_rounding(const Lanes *s) {
     return same;
 }
 
-static void follow(Lanes *s, I by_gains) {
+TGCO_LARGE void follow(Lanes *s, I by_gains) {
     const Problem *p = s->of;
     memcpy(s->Xn, s->X, NX * sizeof(V));
     for (int64_t k = 0; k < p->N; k++) {
-        V *x = s->Xn + k * NX, *u = s->Un + k * NU;
-        const V *K = s->G + k * NU * NZ;
+        OUT x = s->Xn + k * NX; OUT u = s->Un + k * NU;
+        IN K = s->G + k * NU * NZ;
         for (int j = 0; j < NU; j++) {
             u[j] = k ? s->U[k * NU + j] : s->U[j] + SET(0.0); /* no -0.0 */
             for (int i = 0; i < NX; i++) u[j] += tgco_if(by_gains, K[j * NZ + i]) * (x[i] - s->X[k * NX + i]);
@@ -145,12 +148,12 @@ static void put_followed(Lanes *s, int64_t e, int used) {
     }
 }
 int tgco_follow(const Problem *p, int64_t first, int64_t last) {
-    return put_all(p, first, last, enter_followed, put_followed);
+    return put_all(p, first, last, CALLED(enter_followed), CALLED(put_followed));
 }
 
 #if DIM > 0
 /* Squared distance of the origin from the segment that begins at a and goes along. */
-static inline V from_segment(const V *a, const V *along) {
+static inline V from_segment(IN a, IN along) {
     V length = SET(0.0), toward = SET(0.0), square = SET(0.0);
     for (int i = 0; i < DIM; i++) { ADD(length, along[i], along[i]); SUBTRACT(toward, a[i], along[i]); }
     V share = tgco_choose(length > SET(0.0), toward / length, SET(0.0));
@@ -163,7 +166,7 @@ static inline V from_segment(const V *a, const V *along) {
    infinite without one. Here the lanes are knots: a problem alone takes as long as one of many. */
 int tgco_chords(const Problem *p, int64_t first, int64_t last) {
     int64_t N = p->N, blocks = (N + LANES - 1) / LANES;
-    V *points = aligned_alloc(sizeof(V), 2 * DIM * blocks * sizeof(V)); /* the first and the last one of each line */
+    Numbers points = take_numbers(p, 2 * DIM * blocks); /* the first and the last one of each line */
     if (!points) return 0;
     for (int64_t e = first; e < last; e++) {
         V least = SET(INFINITY), knot;
@@ -184,7 +187,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
                 if (!(squares[j] >= 0)) continue;
                 V radius = SET(p->gain * sqrt(squares[j])), a[DIM], along[DIM];
                 for (int64_t block = 0; block < blocks; block++) {
-                    const V *from = points + 2 * DIM * block, *to = from + DIM;
+                    IN from = points + 2 * DIM * block; IN to = from + DIM;
                     for (int l = 0; l < LANES; l++) LANE(knot, l) = block * LANES + l < N ? block * LANES + l : N - 1;
                     for (int d = 0; d < DIM; d++) {
                         V b = to[d] - SET(o[d]);
@@ -204,7 +207,7 @@ int tgco_chords(const Problem *p, int64_t first, int64_t last) {
         p->merit[e] = LANE(least, 0);
         for (int l = 1; l < LANES; l++) if (LANE(least, l) < p->merit[e] || LANE(least, l) != LANE(least, l)) p->merit[e] = LANE(least, l);
     }
-    free(points);
+    give(p, points);
     return 1;
 }
 #endif

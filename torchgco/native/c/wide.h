@@ -1,6 +1,5 @@
-/* Vectors of NET_WIDTH neurons of one problem; export/c/wide_scalar.h has the same in plain C. */
+/* Vectors of NET_WIDTH neurons of one problem; scalar/wide.h has the same in plain C. */
 #pragma once
-#include <string.h>
 #include "lanes.h"
 
 #ifdef __AVX512F__

@@ -125,8 +125,9 @@ class Ahead:
                 continue
             back = ca.SX.sym(f"v{i}", call.inputs.numel())
             upper = ca.SX.sym(f"h{i}", len(columns) * (len(columns) + 1) // 2)
-            place = self._places[i]
-            stages.append(NetStage(self.stages[place].source, by, ca.vertcat(back, upper), place))
+            ahead = self.stages[self._places[i]]
+            assert isinstance(ahead, NetStage)
+            stages.append(NetStage(ahead.source, by, ca.vertcat(back, upper), self._places[i]))
             pairs = [(p, q) for first, p in enumerate(columns) for q in columns[first:]]
             for (p, q), entry in zip(pairs, ca.vertsplit(upper), strict=True):
                 bent[p, q] += entry
@@ -214,7 +215,7 @@ def emit_staged(name: str, inputs: Sequence[Any], outputs: Sequence[Any], stages
         symbols, passed = [*symbols, stage.outputs], f"{passed}, b{i}"
     helpers.append(emit.emit(f"{name}_end", ca.Function(name, symbols, [*outputs]), emit.SHARED_AT))
     lines.append(f"    {name}_end({passed}, {', '.join(f'out{i}' for i in range(len(outputs)))});")
-    written = ", ".join(f"V *restrict out{i}" for i in range(len(outputs)))
+    written = ", ".join(f"OUT ALONE out{i}" for i in range(len(outputs)))
     head = f"TGCO_APART void {name}({arguments}, {written}) {{"
     return "\n".join([*dict.fromkeys(helpers), head, *lines, "}\n"])
 

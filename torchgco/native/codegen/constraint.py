@@ -81,7 +81,7 @@ def _code(knot: Knot, name: str) -> str:
         calls.emit_staged(f"tgco_{name}_rows", inputs, [knot.rows], calls.values(knot.calls)),
         calls.emit_staged(f"tgco_{name}_slopes", inputs, [ca.vertcat(ca.SX(0, 1), *nonzeros)], ahead.stages),
         f"static inline void tgco_{name}_add(",
-        "    const V *x, const V *u, const V *p, const double *w, const V *by_c, const V *by_cc, V *g, V *H) {",
+        "    IN x, IN u, IN p, const double *w, IN by_c, IN by_cc, OUT g, OUT H) {",
         f"    V e[{max(1, len(places))}];",
         f"    tgco_{name}_slopes(x, u, p, w, e);",
     ]

@@ -20,7 +20,7 @@ SMOOTH_OPERATIONS = (
     "REMAINDER",
 )  # fmt: skip
 _EXPAND = """
-void model_expand(const V *x, const V *u, const V *p, const double *w, const V *y, V *f, V *H) {
+TGCO_BETWEEN_UNITS void model_expand(IN x, IN u, IN p, const double *w, IN y, OUT f, OUT H) {
 #ifdef TGCO_TOGETHER
     tgco_together(x, u, p, w, y, f, H);
 #else
@@ -77,8 +77,8 @@ def _rows_code(knot: Knot, name: str) -> str:
     lines = [
         _curves(f"tgco_{name}_bend", [*inputs, lam], ca.dot(lam, knot.rows), ahead, column if knot.calls else None),
         calls.emit_staged(f"tgco_{name}_slants", inputs, [column], ahead.stages),
-        f"static inline void tgco_{name}_model(const V *x, const V *u, const V *p, const double *w, const V *by,",
-        "    const V *cc, const V *lam, V *const *g, V *H) {",
+        f"static inline void tgco_{name}_model(IN x, IN u, IN p, const double *w, IN by,",
+        "    IN cc, IN lam, OUTS g, OUT H) {",
         f"    V e[{max(1, len(places))}];",
         f"    tgco_{name}_bend(x, u, p, w, lam, e, H);" if knot.calls else f"    tgco_{name}_slants(x, u, p, w, e);",
     ]
@@ -89,7 +89,7 @@ def _rows_code(knot: Knot, name: str) -> str:
         *([] if knot.calls else [f"    tgco_{name}_bend(x, u, p, w, lam, H);"]),
         "}",
         f"static inline void tgco_{name}_along(",
-        "    const V *x, const V *u, const V *p, const double *w, const V *z, V *out) {",
+        "    IN x, IN u, IN p, const double *w, IN z, OUT out) {",
         f"    V e[{max(1, len(places))}];",
         f"    tgco_{name}_slants(x, u, p, w, e);",
         f"    for (int j = 0; j < {knot.rows.numel()}; j++) out[j] = SET(0.0);",
@@ -122,10 +122,10 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
     passed = ", ".join(f"in{i}" for i in range(len(inputs)))
     outputs = [column]
     if slopes is not None:
-        arguments, passed, outputs = f"{arguments}, V *f", f"{passed}, f", [slopes, column]
+        arguments, passed, outputs = f"{arguments}, OUT f", f"{passed}, f", [slopes, column]
     lines = [
         calls.emit_staged(f"{name}_entries", inputs, outputs, stages),
-        f"TGCO_APART void {name}({arguments}, V *H) {{",
+        f"TGCO_APART void {name}({arguments}, OUT H) {{",
         f"    V e[{max(1, len(upper))}];",
         f"    {name}_entries({passed}, e);",
         *(f"    H[{i * size + j}] += e[{k}];" for k, (i, j, _) in enumerate(upper)),
@@ -181,7 +181,7 @@ def _reached(operations: list[int], needs: list[list[int]], through: bool) -> se
 
 def _push(model: DynamicsSource) -> str:
     """`model_push(f, z, out)`: out = F z."""
-    lines = ["void model_push(const V *restrict f, const V *restrict z, V *restrict out) {"]
+    lines = ["TGCO_BETWEEN_UNITS void model_push(IN ALONE f, IN ALONE z, OUT ALONE out) {"]
     lines.append("    for (int i = 0; i < NX; i++) out[i] = SET(0.0);")
     for row, column, index, value in zip(model.rows, model.columns, model.places, model.values, strict=True):
         factor = f"f[{index}]" if index >= 0 else f"SET({emit.literal(value)})"
@@ -195,7 +195,7 @@ def _switches(rows: Iterable[tuple[int, KnotSource]]) -> str:
     for i, source in rows:
         models.append(f"    case {i}: tgco_{source.key}_model(x, u, p, w, by, cc, lam, g, H); break;")
         alongs.append(f"    case {i}: tgco_{source.key}_along(x, u, p, w, z, out); break;")
-    arguments = "int i, const V *x, const V *u, const V *p, const double *w"
-    of_model = f"void model_bend_rows({arguments},\n    const V *by, const V *cc, const V *lam, V *const *g, V *H)"
-    along = f"void model_along_rows(\n    {arguments}, const V *z, V *out)"
+    arguments = "int i, IN x, IN u, IN p, const double *w"
+    of_model = f"TGCO_BETWEEN_UNITS void model_bend_rows({arguments},\n    IN by, IN cc, IN lam, OUTS g, OUT H)"
+    along = f"TGCO_BETWEEN_UNITS void model_along_rows(\n    {arguments}, IN z, OUT out)"
     return f"{emit.switch(of_model, models)}\n{emit.switch(along, alongs)}"

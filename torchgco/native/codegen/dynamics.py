@@ -30,9 +30,9 @@ class DynamicsSource:
     """A model in C, with x (n), u (m), and a problem's own numbers p (count) in vectors V,
     and the numbers w that all problems share:
 
-        static inline void tgco_step(const V *restrict x, const V *restrict u, const V *restrict p,
-                                     const double *restrict w, V *restrict x_next)       n
-        static inline void tgco_jacobian(the same four, V *restrict entries)      computed
+        static inline void tgco_step(IN ALONE x, IN ALONE u, IN ALONE p,
+                                     const double *restrict w, OUT ALONE x_next)         n
+        static inline void tgco_jacobian(the same four, OUT ALONE entries)      computed
 
     No output may overlap an input. [fx, fu] (n, n+m) is zero except at `rows`, `columns`, listed column by column.
     Nonzero i is `values[i]` where `places[i]` is -1, else `entries[places[i]]`.

@@ -31,7 +31,7 @@ SHARED_AT = 3  # of the functions of a model, a cost, a constraint: the input wi
 
 
 def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
-    """`static inline void NAME(const V *restrict in0, ..., V *restrict out0, ...)`, as straight-line code.
+    """`static inline void NAME(IN ALONE in0, ..., OUT ALONE out0, ...)`, as straight-line code; see pointers.h.
 
     An input is an array of its entries, an output one of its nonzeros in the order of its sparsity; outputs overlap
     nothing else. A choice ignores the branch not taken, NaN included. Minimum and maximum are PyTorch's: NaN where one
@@ -48,7 +48,7 @@ def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
     if not function.is_a("SXFunction"):
         raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
     arguments = [f"{input_type(i, shared)} in{i}" for i in range(function.n_in())]
-    arguments += [f"V *restrict out{i}" for i in range(function.n_out())]
+    arguments += [f"OUT ALONE out{i}" for i in range(function.n_out())]
     lines, size = _statements(function, shared)
     work = ", ".join(f"w{i}" for i in range(size))
     declared = [f"V {work};"] if work else []
@@ -65,7 +65,7 @@ def function(name: str, inputs: Sequence[Any], *outputs: Any) -> str:
 
 def input_type(i: int, shared: int | None = SHARED_AT) -> str:
     """The type of input i, a pointer's up to the name."""
-    return "const double *restrict" if i == shared else "const V *restrict"
+    return "const double *restrict" if i == shared else "IN ALONE"
 
 
 def checked(field: str, code: str) -> str:

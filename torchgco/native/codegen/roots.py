@@ -49,7 +49,7 @@ class Newton:
         ]
         if self._derived:
             lines.append(f"{name}_equation({passed}, b{i}, r{i}, A{i});")
-            lines.append(f"newton_factor({q}, A{i}, turns{i});")
+            lines.append(f"const I *turned{i} = newton_factor({q}, A{i}, turns{i}) ? turns{i} : NULL;")
         return lines
 
 
@@ -71,7 +71,7 @@ class _Solved:
 
     def lines(self, name: str, i: int, passed: str) -> list[str]:
         count, q = self.inputs.numel(), self._size
-        solve = f"{self.function}({q}, {count // q}, A{self.ahead}, turns{self.ahead}, a{i}, b{i});"
+        solve = f"{self.function}({q}, {count // q}, A{self.ahead}, turned{self.ahead}, a{i}, b{i});"
         return [f"V a{i}[{max(1, count)}], b{i}[{max(1, count)}];", f"{name}({passed}, a{i});", solve]
 
 

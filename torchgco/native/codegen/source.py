@@ -4,7 +4,7 @@ the sparse Jacobian and its functions, and those of the solver, which are compil
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,23 +16,25 @@ from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes, neurons
 from torchgco.native.declarations import defines
 from torchgco.native.includes import included, joined
-from torchgco.native.structures import HEADER, Kind, constants
+from torchgco.native.structures import HEADER, constants
 
 LANES = lanes()
 FEW_LANES = 2, 4  # lanes of libraries for few problems: lanes without a problem take time, too
 LIBRARIES_KEPT = 64  # libraries, the most recent ones
 WRITTEN_OUT = 400  # nonzeros of a Jacobian, at most, that are written out one by one
+OFFERED = "TGCO_BETWEEN_UNITS"  # of functions that other units call
 LOOPS = """
-static inline V entry(int e, const V *f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
-static void tgco_gather(const V *restrict P, const V *restrict f, V *restrict T) {
+static inline V entry(int e, IN f) { return F_place[e] < 0 ? SET(F_value[e]) : f[F_place[e]]; }
+static void tgco_gather(IN ALONE P, IN ALONE f, OUT ALONE T) {
     for (int i = 0; i < NX * (NX + NU); i++) T[i] = SET(0.0);
     for (int e = 0; e < COUNT; e++) {
-        V a = entry(e, f), *to = T + F_column[e] * NX;
-        const V *from = P + F_row[e] * NX;
+        V a = entry(e, f);
+        OUT to = T + F_column[e] * NX;
+        IN from = P + F_row[e] * NX;
         for (int r = 0; r < NX; r++) ADD(to[r], a, from[r]);
     }
 }
-static void tgco_product(const V *restrict f, const V *restrict T, V *restrict H) {
+static void tgco_product(IN ALONE f, IN ALONE T, OUT ALONE H) {
     for (int i = 0; i < (NX + NU) * (NX + NU); i++) H[i] = SET(0.0);
     for (int e = 0; e < COUNT; e++) {
         int c = F_column[e];
@@ -40,7 +42,7 @@ static void tgco_product(const V *restrict f, const V *restrict T, V *restrict H
         for (int l = c; l < NX + NU; l++) ADD(H[c * (NX + NU) + l], a, T[l * NX + F_row[e]]);
     }
 }
-static void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict g) {
+static void tgco_pull_back(IN ALONE p, IN ALONE f, OUT ALONE g) {
     for (int i = 0; i < NX + NU; i++) g[i] = SET(0.0);
     for (int e = 0; e < COUNT; e++) ADD(g[F_column[e]], entry(e, f), p[F_row[e]]);
 }
@@ -111,21 +113,25 @@ class Form:
         functions = tuple((i, rows.key) for i, rows in self.functions)
         return self.dynamics.key, p and (p.start, p.stop), cost, self.dense, functions, tuple(sorted(self.lifted))
 
-    def alone(self, kinds: Iterable[Kind], declared: str, given: Mapping[str, str]) -> str:
-        """C of a single lane that needs no other unit: the interior point, sweeps and rollouts.
+    def alone(self, files: Sequence[str], given: Mapping[str, str], declared: str = "", **constants_of: Any) -> str:
+        """C of a single lane that needs no other unit.
 
         Args:
-            kinds: of the rows that there are; no code for others is left.
-            declared: what comes after the structures.
+            files: of C, beside those of the model and its cost.
             given: texts that stand for vectors.h and others, by their names.
+            declared: what comes after the structures.
+            constants_of: macros, such as the type REAL or KINDS, the bits of the kinds of rows that there are.
         """
-        generated = [*self._model_code(), curvature_code(self.dynamics, self.functions)]
+        generated = self._model_code()
+        if "riccati.c" in files:
+            generated.append(curvature_code(self.dynamics, self.functions))
         texts = {"constants.h": constants(), "code.h": "\n".join(generated)}
-        kept = {"NET_WIDTH": neurons(), "REAL": "double", "LANES": 1, "KINDS": sum(1 << kind for kind in set(kinds))}
+        kept = {"NET_WIDTH": neurons(), "REAL": "double", "LANES": 1} | constants_of
         sizes = kept | self._sizes | _space(self.position)
         sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none
-        files = included("model.c", self._cost_file, "riccati.c", "interior.c", "sweep.h", "rollout.h")
-        return joined(defines(sizes) + included("structures.h") + declared + files, given=texts | dict(given))
+        files = "model.c", self._cost_file, *files
+        text = defines(sizes) + included("structures.h") + declared + included(*files)
+        return joined(text, given=texts | dict(given))
 
     @property
     def _sizes(self) -> dict[str, Any]:
@@ -232,10 +238,10 @@ def _written_out(model: DynamicsSource) -> str:
     pull_back = [f"    g[{c}] = {total(by_column[c], 'p[{}]')};" for c in columns]
     return "\n".join(
         [
-            "static inline void tgco_gather(const V *restrict P, const V *restrict f, V *restrict T) {",
-            "    for (int r = 0; r < NX; r++) {", "        const V *p = P + r;", *gather, "    }", "}",
-            "static inline void tgco_product(const V *restrict f, const V *restrict T, V *restrict H) {", *product, "}",
-            "static inline void tgco_pull_back(const V *restrict p, const V *restrict f, V *restrict g) {",
+            "static inline void tgco_gather(IN ALONE P, IN ALONE f, OUT ALONE T) {",
+            "    for (int r = 0; r < NX; r++) {", "        IN p = P + r;", *gather, "    }", "}",
+            "static inline void tgco_product(IN ALONE f, IN ALONE T, OUT ALONE H) {", *product, "}",
+            "static inline void tgco_pull_back(IN ALONE p, IN ALONE f, OUT ALONE g) {",
             *pull_back, "}",
         ]
     )  # fmt: skip
@@ -252,11 +258,13 @@ def _switches(functions: Iterable[tuple[int, KnotSource]], lifted: Container[int
             slopes.append(f"        *columns = {name}_columns; return {name}_count;")
         else:
             adds.append(f"    case {i}: {name}_add(x, u, p, w, by_c, by_cc, g, H); break;")
-    arguments = "int i, const V *x, const V *u, const V *p, const double *w"
+    arguments = "int i, IN x, IN u, IN p, const double *w"
     return "\n".join(
         (
-            switch(f"void model_rows({arguments}, V *c)", values),
-            switch(f"void model_add_rows(\n    {arguments}, const V *by_c, const V *by_cc,\n    V *g, V *H)", adds),
-            switch(f"int model_slopes(\n    {arguments}, V *e, const int **columns)", slopes, "    return 0;"),
+            switch(f"{OFFERED} void model_rows({arguments}, OUT c)", values),
+            switch(f"{OFFERED} void model_add_rows(\n    {arguments}, IN by_c, IN by_cc,\n    OUT g, OUT H)", adds),
+            switch(
+                f"{OFFERED} int model_slopes(\n    {arguments}, OUT e, const int **columns)", slopes, "    return 0;"
+            ),
         )
     )

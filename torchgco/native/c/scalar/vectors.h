@@ -1,8 +1,6 @@
 /* vectors.h for a single lane in plain C99: V is a number, and I is 0 where false. */
 #pragma once
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
+#include "standard.h"
 #include "real.h"
 
 #define TGCO_MATH(name) TGCO_JOIN(name, TGCO_JOIN(TGCO_SUFFIX_, REAL))
@@ -13,8 +11,11 @@ typedef int I;
 #define NOT(where) (!(where))
 
 #define TGCO_INLINE static inline
+#ifndef TGCO_APART
 #define TGCO_APART static
 #define TGCO_BETWEEN_UNITS static
+#define TGCO_LARGE static
+#endif
 
 static inline V tgco_set(double c) { return (V)c; }
 
@@ -30,6 +31,7 @@ static inline V tgco_fused(V a, V b, V c) {
 
 static inline V tgco_choose(I where, V a, V b) { return where ? a : b; }
 static inline V tgco_if(I where, V a) { return where ? a : (V)0; }
+static inline V tgco_permuted(V a, I index) { (void)index; return a; }
 static inline int tgco_any(I where) { return where != 0; }
 static inline V tgco_fabs(V a) { return TGCO_MATH(fabs)(a); }
 static inline V tgco_copysign(V a, V b) { return TGCO_MATH(copysign)(a, b); }

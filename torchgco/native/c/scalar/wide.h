@@ -1,6 +1,5 @@
 /* wide.h in plain C: the same sums, in the same order, of as many neurons. NET_WIDTH is given. */
 #pragma once
-#include <string.h>
 #include "lanes.h"
 
 typedef struct { REAL of[NET_WIDTH]; } Wide;

@@ -1,0 +1,131 @@
+"""Rows within a stage: dense violations, in C and PyTorch, in free time; wrong use."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from torchgco import (
+    BetweenKnots,
+    Constraint,
+    ControlBounds,
+    FreeTime,
+    FunctionConstraint,
+    FunctionDynamics,
+    NormBounds,
+    Problem,
+    QuadraticCost,
+    Spheres,
+    StateBounds,
+    kernels,
+)
+from torchgco.base.errors import InputError
+from torchgco.native.compiler import find_compiler
+from torchgco.problem.between import between
+
+compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+POINT = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.35, "rk4", position=slice(0, 2))
+RING = (
+    FunctionConstraint(lambda x: x[..., :2].square().sum(-1, keepdim=True) - 1.1**2, name="outer"),
+    FunctionConstraint(lambda x: 0.9**2 - x[..., :2].square().sum(-1, keepdim=True), name="inner"),
+)
+
+
+def half_a_turn(*rows: Constraint, N: int = 5) -> tuple[Problem, Tensor]:
+    """A point that goes around in a ring of 0.9 to 1.1 m by few stages, and states to begin with."""
+    angles = torch.linspace(0.0, torch.pi, N + 1, dtype=torch.float64)
+    guess = torch.stack((angles.cos(), angles.sin(), 0 * angles, 0 * angles), -1)[None]
+    cost = QuadraticCost(Q=[0.0] * 4, R=[0.01] * 2, Qf=[100, 100, 10, 10], x_ref=[-1.0, 0, 0, 0])
+    x0 = torch.tensor([[1.0, 0.0, 0.0, 0.3]]).double()
+    return Problem(POINT, cost, [ControlBounds(-9.0, 9.0), *RING, *rows], x0, N), guess
+
+
+def densest(problem: Problem, solution: torchgco.Solution) -> float:
+    """By how much the ring is left, m, at 200 instants of each stage."""
+    k = torch.arange(problem.N).repeat_interleave(200)
+    h = (torch.arange(200) / 200 * problem.dynamics.dt).double().repeat(problem.N)
+    x = between(problem.dynamics, solution.X, solution.U, k, h, torch.full_like(h, problem.dynamics.dt))
+    distance = x[..., :2].norm(dim=-1)
+    return float(torch.maximum(distance - 1.1, 0.9 - distance).max())
+
+
+@compiled
+def test_few_points_keep_nearly_all_of_the_way() -> None:
+    left, costs = [], []
+    for points in (0, 1, 3, 7):
+        problem, X0 = half_a_turn(*(BetweenKnots(row, POINT, points) for row in RING if points))
+        solution = torchgco.solve(problem, solver="interior_point", X0=X0, verbose=False)
+        assert solution.statuses[0].name == "CONVERGED"
+        left.append(densest(problem, solution))
+        costs.append(float(solution.cost))
+    assert left[0] > 1e-2 and left[1] < 0.25 * left[0] and left[2] < 1e-3 and left[3] < 3e-4
+    assert costs == sorted(costs)
+
+
+@compiled
+def test_bounds_hold_where_states_overshoot() -> None:
+    """A fast swing: the speed has its peak within a stage."""
+    swing = FunctionDynamics(
+        lambda x, u: torch.stack((x[..., 1], u[..., 0] - 9.0 * x[..., 0]), -1), 2, 1, 0.4, "radau5"
+    )
+    cost = QuadraticCost(Q=[1.0, 0.0], R=[0.01], Qf=[10.0, 10.0])
+    x0, limits = torch.tensor([[1.0, 0.0], [0.8, 0.3]]).double(), ControlBounds(-6.0, 6.0)
+    for bound in (StateBounds([-9.0, -1.5], [9.0, 1.5]), NormBounds(("x", [1]), upper=1.5)):
+        fastest = []
+        for rows in ([bound], [bound, BetweenKnots(bound, swing, 4)]):
+            problem = Problem(swing, cost, [limits, *rows], x0, 12)
+            solution = torchgco.solve(problem, verbose=False)
+            assert [status.name for status in solution.statuses] == ["CONVERGED"] * 2
+            k, h = torch.arange(12).repeat_interleave(50), (torch.arange(50) / 50 * 0.4).double().repeat(12)
+            x = between(swing, solution.X, solution.U, k, h, torch.full_like(h, 0.4))
+            fastest.append(float(x[..., 1].abs().max()))
+        assert fastest[0] > 1.52 and fastest[1] < 1.505
+        one = torchgco.solve(problem.take(torch.tensor([1])), verbose=False)
+        assert torch.equal(one.U[0], solution.U[1])
+
+
+@compiled
+def test_c_pytorch_and_free_time() -> None:
+    problem, X0 = half_a_turn(*(BetweenKnots(row, POINT) for row in RING))
+    in_c = torchgco.solve(problem, solver="interior_point", X0=X0, verbose=False)
+    assert float(torchgco.judge(problem, in_c.U).violation) < 1e-3
+    rows = problem.constraints[-1].value(in_c.X, in_c.U)
+    assert rows.shape == (1, 5, 3) and float(rows.max()) < 1e-3
+    free = replace(problem, time=FreeTime(0.5, 3.0, weight=0.1))
+    freely = torchgco.solve(free, solver="interior_point", X0=X0, verbose=False)
+    assert freely.statuses[0].name == "CONVERGED"
+    assert float(torchgco.judge(free, freely.U, times=freely.t).violation) < 1e-3
+    kernels.use_native(False)
+    try:
+        slow = torchgco.solve(problem, solver="al_ilqr", U0=in_c.U, verbose=False)
+        assert float(slow.cost) == pytest.approx(float(in_c.cost), rel=1e-3)
+    finally:
+        kernels.use_native(True)
+
+
+def test_stages_are_those_that_end_at_the_knots() -> None:
+    row = FunctionConstraint(lambda x: x[..., :1], knots=[0, 2, 5])
+    problem, _ = half_a_turn(BetweenKnots(row, POINT, 2))
+    assert problem.constraints[-1].knots.tolist() == [1, 4]
+    assert problem.constraints[-1].value(*problem.at_rest).shape == (1, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("within", "word"),
+    [
+        (BetweenKnots(RING[0], POINT, 0), "points"),
+        (BetweenKnots(RING[0], POINT, 2.5), "points"),  # type: ignore[arg-type]
+        (BetweenKnots(RING[0], None), "model"),
+        (BetweenKnots(RING[0], replace(POINT, integrator="none")), "model"),
+        (BetweenKnots(Spheres([[0.0, 0.0]], [0.1]), POINT), "constraint"),
+        (BetweenKnots(FunctionConstraint(lambda x: x[..., :1], sense="equality"), POINT), "constraint"),
+        (BetweenKnots(3, POINT), "constraint"),
+    ],
+)
+def test_wrong_use_is_told(within: BetweenKnots, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        half_a_turn(within)
