@@ -27,7 +27,7 @@ LAYERS = [
     ["view"],
     ["baselines"],
     ["presets"],
-    ["fleets"],
+    ["fleets", "guesses", "warned"],
     ["api", "envs"],
     ["compiled"],
     ["export"],

@@ -44,6 +44,7 @@ from torchgco.constraints import (
     ControlBounds,
     FunctionConstraint,
     Gates,
+    Integral,
     Link,
     NormBounds,
     RateBounds,
@@ -66,6 +67,7 @@ from torchgco.dynamics import (
 from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.judging import judge
+from torchgco.guesses import Guess
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
@@ -92,11 +94,11 @@ __all__ = [  # noqa: RUF022
     "QuadrotorPlanning", "QuadrotorPlant", "QuadrotorThrusts",
     "RotorTracking", "Airframe", "Cost", "QuadraticCost", "Constraint", "Spheres", "Body", "Boxes", "Capsules",
     "Ellipsoids", "OscillatingBoxes", "Moved", "ControlBounds", "StateBounds", "RateBounds", "NormBounds", "Cone",
-    "Gates", "Separation", "Link", "BetweenKnots", "FirstStepRates", "FunctionConstraint", "FunctionCost",
+    "Gates", "Separation", "Link", "Integral", "BetweenKnots", "FirstStepRates", "FunctionConstraint", "FunctionCost",
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
+    "solve", "Guess", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
     "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",

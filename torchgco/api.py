@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -15,32 +14,28 @@ import torch
 from torch import Tensor
 
 from torchgco.base import clock
-from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, InputError, ScaleWarning, StepWarning, shown
+from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Positive, check_value, option_places
 from torchgco.base.shapes import check_shape, check_untransformed, computing_on
-from torchgco.base.status import Status
 from torchgco.constraints.bounds import bounds_of
 from torchgco.constraints.norms import within_norms
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.solve import solve_fleet
-from torchgco.judging.scale import SHARE, dwarfed, noise
-from torchgco.judging.steps import step_errors
-from torchgco.judging.worst import NO_PLACE, kind_of
-from torchgco.kernels import copied_to, costates, current, on_cpu, open_loop, served_by
-from torchgco.lagrangian.quality import has_arrived, ranks_arrival
+from torchgco.guesses import Guess, guesses_of, solve_guesses
+from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.in_time import at_times, guessing_times
+from torchgco.problem.in_time import guessing_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.refusals import spared
 from torchgco.search import Restarts
-from torchgco.search.reach import short_horizons
 from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
-from torchgco.solvers.ending import touches
 from torchgco.solvers.watching import Watcher
+from torchgco.warned import warn_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +44,6 @@ if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage
 
 LEAST_SECONDS = 1e-3  # of a solve for whose fleet no time is left
-CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 
 
 @overload
@@ -65,6 +59,7 @@ def solve(
     record: bool = False,
     verbose: bool | None = None,
     smoothing: float | None = None,
+    guesses: Sequence[Guess | Solution | Mapping[str, Any]] | None = None,
     **misplaced: Never,
 ) -> Solution: ...
 @overload
@@ -91,6 +86,7 @@ def solve(
     record: bool = False,
     verbose: bool | None = None,
     smoothing: float | None = None,
+    guesses: Sequence[Guess | Solution | Mapping[str, Any]] | None = None,
     **misplaced: Never,
 ) -> Solution | FleetSolution:
     """Solve every problem of the batch; of a `Fleet` all vehicles, of which solver, seed, ids and max_seconds are.
@@ -118,6 +114,7 @@ def solve(
             end. None: in a terminal and in a notebook a bar on stderr, once it takes 2 s; False: nothing.
         smoothing: mu > 0 in units of the cost: the minimum of J_var - mu sum log(-c) over all rows c <= 0 near the
             solver's, FEASIBLE, whose gradients are smooth; `solution.reason` where none is found. None: the solver's.
+        guesses: several per problem, in the place of U0, X0 and warm; see `Guess`. The best result of each is kept.
 
     Raises:
         InputError: U0, ids, warm, X0 or an argument don't fit, no preset has this name, the solver can't begin with X0,
@@ -125,25 +122,42 @@ def solve(
     """
     check_untransformed("solve")
     if isinstance(problem, Fleet):
-        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing, **misplaced}
-        return _solve_fleet(problem, others, solver, seed, ids, max_seconds)
+        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing}
+        return _solve_fleet(problem, others | {"guesses": guesses, **misplaced}, solver, seed, ids, max_seconds)
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
     name, record = _refuse(misplaced, problem, solver), check_value(record, bool, "record")
+    tried = _tried(guesses, problem, {"U0": U0, "X0": X0, "warm": warm, "record": record or None})
     solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
-        problem, (U0, ids, warm, X0) = there, copied_to((U0, ids, warm, X0), there.x0)
+        problem, (U0, ids, warm, X0, tried) = there, copied_to((U0, ids, warm, X0, tried), there.x0)
     with served_by(asked.x0.device):
         problem, U0 = spared(problem, partial(_start, warm, solver, U0))
         multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
-        watched = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-        with closing(watched):
-            found = solver.solve(problem, U0, seed, ids, multipliers, watched.callback, max_seconds, X0)
-            watched.end(found)
-        _warn(problem, found, warm is None)
+        watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
+        found = _watched(watcher, solver, tried, (problem, U0, seed, ids, multipliers), max_seconds, X0)
+        warn_of(problem, found, warm is None)
         problem, found = _returned(asked, problem, found, name)
         return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
+
+
+def _watched(
+    watcher: Watcher,
+    solver: Solver,
+    guesses: Sequence[Guess] | None,
+    call: tuple[Problem, Tensor, int, Tensor | None, Multipliers | None],
+    max_seconds: float | None,
+    X0: Tensor | None,
+) -> Solution:
+    """The solution of a call, from several guesses where there are some, under the eyes of the watcher."""
+    with closing(watcher):
+        if guesses is None:
+            found = solver.solve(*call, watcher.callback, max_seconds, X0)
+        else:
+            found = solve_guesses(solver, guesses, *call[:4], watcher.callback, max_seconds)
+        watcher.end(found)
+        return found
 
 
 def _returned(asked: Problem, problem: Problem, found: Solution, name: str | None) -> tuple[Problem, Solution]:
@@ -274,6 +288,15 @@ def _checked(warm: Any) -> Solution | None:
     return warm and warm.detach()
 
 
+def _tried(guesses: Any, problem: Problem, others: Mapping[str, Any]) -> tuple[Guess, ...] | None:
+    """The guesses, bound; InputError beside what they take the place of."""
+    if guesses is None:
+        return None
+    if given := [name for name, value in others.items() if value is not None]:
+        raise InputError(f"solve.{given[0]}", "None beside guesses, each of which is solved from", given[0])
+    return guesses_of(guesses, problem)
+
+
 def _start(warm: Solution | None, solver: Solver, U0: Tensor | None, problem: Problem) -> tuple[Problem, Tensor]:
     """Controls (B, N, m) to begin with, where none are given, and the problem with the guess of its free starts."""
     if problem.B > 0:
@@ -292,80 +315,6 @@ def _start(warm: Solution | None, solver: Solver, U0: Tensor | None, problem: Pr
     whole = for_solvers(problem)
     solver.announce(whole)
     return problem, _guess(problem, whole)
-
-
-def _warn(problem: Problem, solution: Solution, cold: bool) -> None:
-    """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
-    claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
-    if solution.account is not None:
-        problem = solution.account.problem or problem  # whose code may refuse states
-    if cold:
-        _warn_of_horizon(problem, solution, claims)
-    _warn_of_scale(problem, solution, claims)
-    _warn_of_steps(problem, solution, claims)
-    _warn_of_contact(problem, solution)
-
-
-def _warn_of_horizon(problem: Problem, solution: Solution, claims: Tensor) -> None:
-    """A HorizonWarning where no feasible trajectory arrives, as none can."""
-    if not ranks_arrival(problem) or bool((claims & has_arrived(problem, solution.X)).all()):
-        return
-    if (told := short_horizons(problem)) is not None:
-        warnings.warn(told, HorizonWarning, stacklevel=4)
-
-
-def _warn_of_contact(problem: Problem, solution: Solution) -> None:
-    """A ContactWarning where trajectories keep all rows and are INFEASIBLE between the knots."""
-    touching = touches(problem, solution).nonzero().flatten().tolist()
-    if touching:
-        named = ", ".join(map(str, touching[:NAMED])) + (", ..." if len(touching) > NAMED else "")
-        warnings.warn(
-            f"{len(touching)} of {problem.B} trajectories are INFEASIBLE, as they touch an obstacle between the knots, "
-            f"while all constraints hold at them: problem {named} (to_frame(problem) has their clearance; "
-            "shorter time steps help)",
-            ContactWarning,
-            stacklevel=4,
-        )
-
-
-def _warn_of_scale(problem: Problem, solution: Solution, claims: Tensor) -> None:
-    """A ScaleWarning where a violation that counts as feasible leaves little of a constraint."""
-    rows = (claims & (solution.violation > noise(solution.X, solution.U))).nonzero().flatten()
-    if rows.numel() == 0:
-        return
-    some, X, U = at_times(
-        problem.take(rows), solution.X[rows], solution.U[rows], None if solution.times is None else solution.times[rows]
-    )
-    place = dwarfed(some, X, U)
-    large = (place != NO_PLACE).nonzero().flatten().tolist()
-    if large:
-        b, i = int(rows[large[0]]), int(place[large[0]])
-        warnings.warn(
-            f"{len(large)} of {problem.B} trajectories count as feasible although a violation is over {SHARE:.0%} of "
-            f"the constraint's own values: problem {b}, constraints[{i}] ({kind_of(problem.constraints[i])}), by up to "
-            f"{float(solution.violation[b]):.2g}; choose units in which the constraint is larger, or a smaller "
-            "violation_tolerance of the solver",
-            ScaleWarning,
-            stacklevel=4,
-        )
-
-
-def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None:
-    """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
-    rows = claims.nonzero().flatten()
-    if rows.numel() == 0:
-        return
-    part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]
-    times = None if solution.times is None else solution.times[rows]
-    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
-    long = found.large.nonzero().flatten().tolist()
-    if long:
-        warnings.warn(
-            f"{len(long)} of {problem.B} trajectories take steps that are too long for their model: problem "
-            f"{int(rows[long[0]])}, where {found.told(long[0], problem)}; a smaller dt shows what is true",
-            StepWarning,
-            stacklevel=4,
-        )
 
 
 def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | Sequence[int] | None = None) -> Figure:

@@ -25,6 +25,7 @@ from torchgco.explaining.account import Account
 from torchgco.explaining.explain import Explanation, explanation
 from torchgco.explaining.record import Comparison as Comparison
 from torchgco.explaining.record import Fate as Fate
+from torchgco.explaining.record import GuessRecord as GuessRecord
 from torchgco.explaining.record import SearchRecord as SearchRecord
 from torchgco.explaining.record import Standing as Standing
 from torchgco.judging.judge import columns as judged
@@ -67,6 +68,8 @@ class Solution:
     times: Tensor | None = None  # (B, N+1): times of the knots, s, where the time is free; None: see `t`
     # (B,), s: where the time is free and its longest doesn't do, a duration that does, NaN where none was found
     needed: Tensor | None = None
+    guess: Tensor | None = None  # (B,) int64: of several guesses the one that led here; None: there was one
+    guesses: GuessRecord | None = None  # what became of each of them: `solution.guesses.to_frame()`
     reason: Tensor | None = None  # (B,) int64, see Differentiability; None: not asked for
     account: Account | None = None  # the problem and the solver, for `t` and `explain`; of a loaded one the times alone
 
@@ -167,7 +170,7 @@ class Solution:
         lost, none = torch.full_like(self.cost, torch.nan), torch.zeros_like(self.status)
         return replace(
             self, X=X, U=U, K=K, d=d, multipliers=multipliers, cost=lost, violation=lost, status=none, iterations=none,
-            outer_iterations=none, guided=none, trace=None, search=None,
+            outer_iterations=none, guided=none, trace=None, search=None, guess=None, guesses=None,
         )  # fmt: skip
 
     def __getitem__(self, index: Any) -> Solution:
@@ -224,7 +227,7 @@ class Solution:
         return f"Solution(B={B}, N={N}, n={self.X.shape[-1]}, m={m}: {ended}; {costs})"
 
     def to_frame(self, problem: Problem | None = None) -> pd.DataFrame:
-        """One row per problem: status, cost, violation and the iteration counts; the horizon where they differ.
+        """One row per problem: status, cost, violation and the iteration counts; horizon and guess where they differ.
 
         Where it is known, `kernels` says what solved: "native", "pytorch", or another library's name.
 
@@ -243,6 +246,8 @@ class Solution:
             columns[name] = getattr(self, name).detach().cpu().numpy()
         if self.horizon is not None:
             columns["horizon"] = self.horizon.cpu().numpy()
+        if self.guess is not None:
+            columns["guess"] = self.guess.cpu().numpy()
         if self.times is not None:
             columns["duration"] = self.duration.detach().cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
@@ -324,6 +329,8 @@ class Solution:
         arrays["status"], arrays["mu"] = self.status.cpu().numpy(), self.multipliers.mu.cpu().numpy()
         if self.times is not None:
             arrays["times"] = self.times.detach().cpu().numpy()
+        if self.guess is not None:
+            arrays["guess"] = self.guess.cpu().numpy()
         if self.account is not None and self.account.kernels is not None:
             arrays["kernels"] = np.array(self.account.kernels)
         for i, lam in enumerate(self.multipliers.lam):
@@ -340,7 +347,7 @@ class Solution:
         where = check_device(device)
         arrays = read_arrays(path, "path", "a solution file", {*_TENSORS, "mu"})
         count = next(i for i in range(len(arrays)) if f"lam{i}" not in arrays)
-        more = [name for name in ("horizon", "t", "times") if name in arrays]
+        more = [name for name in ("horizon", "t", "times", "guess") if name in arrays]
         names = (*_TENSORS, "mu", *(f"lam{i}" for i in range(count)), *more)
         strange = [name for name in names if arrays[name].dtype.kind not in "iuf"]
         if strange:
@@ -353,7 +360,7 @@ class Solution:
         tensors_kept: dict[str, Any] = {name: tensors[name] for name in _TENSORS}
         kernels = str(arrays["kernels"]) if "kernels" in arrays else None
         account = Account(t=tensors.get("t"), kernels=kernels) if "t" in tensors or kernels is not None else None
-        tensors_kept |= {name: tensors.get(name) for name in ("horizon", "times")}
+        tensors_kept |= {name: tensors.get(name) for name in ("horizon", "times", "guess")}
         return cls(multipliers=Multipliers(lam, tensors["mu"]), account=account, **tensors_kept)
 
 
@@ -372,7 +379,7 @@ def _places(index: Any, B: int, device: torch.device) -> Tensor:
     return torch.where(rows < 0, rows + B, rows).long()
 
 
-_OTHERS = ("multipliers", "trace", "search", "horizon", "times", "needed", "reason", "account")
+_OTHERS = "multipliers", "trace", "search", "horizon", "times", "needed", "guess", "guesses", "reason", "account"
 _TENSORS = tuple(f.name for f in fields(Solution) if f.name not in _OTHERS)
 # What torch.load may make of a file of torch.save; they hold tensors, and run nothing.
-torch.serialization.add_safe_globals([Solution, Multipliers, Account, SearchRecord, Comparison, Standing])
+torch.serialization.add_safe_globals([Solution, Multipliers, Account, GuessRecord, SearchRecord, Comparison, Standing])

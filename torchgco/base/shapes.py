@@ -162,6 +162,7 @@ class Dimensions:
     horizon: Tensor | None = None  # (B,) int64: stages of each problem, where they differ
     state_names: tuple[str, ...] = ()  # of the model's states, where it names them
     free_time: bool = False  # whether stages last a multiple of dt that is chosen
+    model: Any = None  # the dynamics, bound
 
 
 def space_of(dims: Dimensions, field: str) -> int:

@@ -25,6 +25,7 @@ from torchgco.compiled.answer import Answer
 from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
 from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.numbers import Numbers
+from torchgco.constraints.integral import Integral
 from torchgco.explaining.account import Account
 from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
@@ -115,6 +116,8 @@ class Compiled:
     ) -> None:
         if problem.time is not None and receding:
             raise InputError("receding", "False where the time is free: calls say what has `elapsed`, s", True)
+        if any(isinstance(part, Integral) for part in problem.constraints):
+            raise InputError("problem", "one without Integral in compiled problems and loops", "Integral")
         self._device, there = problem.x0.device, held_on_cpu(problem)
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
         self._given: Problem | None = problem

@@ -116,14 +116,14 @@ class Link(Constraint):
     def with_carried(self, first: int) -> Constraint:
         assert self.function is not None
         places = first + torch.arange(len(self.components), device=self.components.device), self.components
-        return _Rows(self.function, self.sense, self.knots, name=self.name, values=self.values, places=places)
+        return CarriedRows(self.function, self.sense, self.knots, name=self.name, values=self.values, places=places)
 
 
 @dataclass(frozen=True)
-class _Rows(FunctionConstraint):
-    """The same of knot j alone, whose state has a copy of x_i among its last components."""
+class CarriedRows(FunctionConstraint):
+    """Rows of one knot, some of whose states are carried ones: function of some components after others."""
 
-    places: tuple[Tensor, ...] = ()  # where a state has the components of x_i, and those of x_j, (r,) int64 both
+    places: tuple[Tensor, ...] = ()  # of each argument which states it is, (r,) int64
 
     def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
         (x,) = arguments

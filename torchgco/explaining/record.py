@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+from torchgco.base.status import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class Fate(IntEnum):
@@ -47,6 +53,24 @@ class Standing:
     violation: Tensor  # (b,): metres for lengths
     goal_distance: Tensor  # (b,), m, of the last knot; NaN without a goal
     arrived: Tensor  # (b,) bool: feasible, and within the solver's tolerance of the goal
+
+
+@dataclass(frozen=True)
+class GuessRecord:
+    """What became of every guess: of B problems and k guesses each."""
+
+    cost: Tensor  # (B, k): J_var
+    violation: Tensor  # (B, k): metres for lengths
+    status: Tensor  # (B, k) int64, see Status
+    iterations: Tensor  # (B, k) int64
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row per problem (`element`) and guess, with its status, cost, violation and iterations."""
+        import pandas as pd
+
+        index = pd.MultiIndex.from_product([range(size) for size in self.cost.shape], names=["element", "guess"])
+        columns = {name: getattr(self, name).flatten().cpu().numpy() for name in ("cost", "violation", "iterations")}
+        return pd.DataFrame({"status": [Status(s).name for s in self.status.flatten().tolist()]} | columns, index)
 
 
 @dataclass

@@ -62,8 +62,8 @@ def export_c(
 
     Raises:
         InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
-            start, horizons, `RateBounds` or `Link`, single precision, code that can't be compiled; a number that can't
-            change. No file is written then.
+            start, horizons, `RateBounds`, `Link` or `Integral`, single precision, code that can't be compiled; a number
+            that can't change. No file is written then.
     """
     check_value(receding, bool, "receding")
     check_value(build, Build, "build")
@@ -98,7 +98,9 @@ def _checked(problem: Problem) -> Problem:
             raise InputError(f"problem.{field}", "None in exported C", type(found).__name__)
     for i, part in enumerate(problem.constraints):
         if part.joins_knots:
-            raise InputError(f"constraints[{i}]", "one without RateBounds and Link in exported C", type(part).__name__)
+            raise InputError(
+                f"constraints[{i}]", "one without RateBounds, Link and Integral in exported C", type(part).__name__
+            )
     return problem
 
 

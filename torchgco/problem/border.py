@@ -41,7 +41,7 @@ ANY_AXES = (
 )
 ONE_STAGE = "numbers of a stage that depend on its own state and control alone (changes along the way: an extra state)"
 ONE_KNOT = (
-    "rows of one knot (sums along knots: an extra state; changes of controls: RateBounds; two knots: Link; "
+    "rows of one knot (sums along knots: Integral or an extra state; changes of controls: RateBounds; two knots: Link; "
     "numbers per knot: `knot_values`, or an argument k)"
 )
 

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
+from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
-from torchgco.constraints.carried import Carried, Taken, joined
+from torchgco.constraints.carried import Carried, Carrying, Taken, joined
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.problem.problem import Problem
 
@@ -61,25 +62,28 @@ def rows_of_one_knot(problem: Problem, first: int) -> list[Constraint]:
 class _Dynamics(WrappedDynamics):
     """A model whose states are followed by carried ones."""
 
-    taken: Taken
+    taken: Carrying
     k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where they differ
 
-    batched: ClassVar[tuple[str, ...]] = ("model",)
+    batched: ClassVar[tuple[str, ...]] = ("model", "taken")
 
+    calls_function = property(lambda self: is_users(self.model) or not isinstance(self.taken, Taken))
     n = property(lambda self: self.model.n + len(self.taken))  # type: ignore[assignment]
 
     def at(self, k: int | Tensor) -> Self:
         model = self.model.at(k)
-        if self.taken.stages is not None:
+        if self.taken.by_stage:
             return replace(self, model=model, k=k)
         return self if model is self.model else replace(self, model=model)
 
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         state, carried = x[..., : self.model.n], x[..., self.model.n :]
         self._check_stage()
-        return torch.cat((self.model.step(state, u), self.taken.after(state, u, carried, self.k)), dim=-1)
+        return torch.cat((self.model.step(state, u), self.taken.after(state, u, carried, self.k, self.model)), dim=-1)
 
     def jacobians(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        if not isinstance(self.taken, Taken):
+            return super().jacobians(x, u)
         self._check_stage()
         n, r, stages = self.model.n, torch.arange(len(self.taken), device=x.device), self.taken.stages
         by_x, by_u = self.model.jacobians(x[..., :n], u)
@@ -93,5 +97,5 @@ class _Dynamics(WrappedDynamics):
         return fx, fu
 
     def _check_stage(self) -> None:
-        if self.taken.stages is not None and self.k is None:
+        if self.taken.by_stage and self.k is None:
             raise InputError("dynamics", "a stage, as in `dynamics.at(k).step(x, u)`", "none")

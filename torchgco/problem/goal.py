@@ -9,16 +9,18 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Floats, Number, Wrong, above_zero, finite, numbers
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, per_row, space_of
 from torchgco.base.tree import PerElement
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, whole
 from torchgco.constraints.norms import NormBounds
 from torchgco.costs.base import Cost
 from torchgco.obstacles.base import ADMITTED
 
+AXES = "xyz"
 RADIUS_SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
 
 
@@ -29,6 +31,7 @@ class Goal(PerElement):
         Goal([4.0, 0.0], 0.3)                     # where the trajectory should end: judged, and sought by the search
         Goal([4.0, 0.0], 0.3, required=True)      # |p_N - position| <= radius is a constraint
         Goal(state=[4.0, 0, 0, 0], required=True)  # x_N = state is one: a boundary constraint
+        Goal(state=hover, required=True, quaternion=range(6, 10))  # the same attitude, as q or as -q
 
     A required goal adds its rows to the problem's constraints, as the last of them; where horizons differ they hold at
     each problem's own last knot. Feasible is then what arrives.
@@ -40,16 +43,20 @@ class Goal(PerElement):
         required: whether arriving is a constraint.
         state: (n,), or (B, n) one per problem, in the place of a position; NaN in components that are free at the end,
             the same ones in all problems. Models without a position take one, too: the problem has no `goal` then.
+        quaternion: which four states (w, x, y, z) of `state` are a quaternion: q and -q, one attitude, serve alike. In
+            their place are three rows, about the rotation vector that is left, rad. None: there is none.
 
     Raises:
         InputError: on `Problem(...)`: wrong shapes, values that aren't finite, a radius that isn't above 0, dynamics
-            without a position; a position and a state, or neither; a state that isn't required, or free as a whole.
+            without a position; a position and a state, or neither; a state that isn't required, or free as a whole;
+            a quaternion without a state, of other than four states, or free or 0 in a problem.
     """
 
     position: Any = None
     radius: Any = None
     required: bool = False
     state: Any = None
+    quaternion: Any = None
     assumed: bool = False  # derived from the cost: the radius is a rule of thumb
 
     batched: ClassVar[tuple[str, ...]] = ("position", "radius", "state")
@@ -60,6 +67,8 @@ class Goal(PerElement):
             raise InputError("goal.required", "True or False", shown(self.required))
         if self.state is not None:
             return self._bound_state(dims)
+        if self.quaternion is not None:
+            raise InputError("goal.quaternion", "None without a state, which says the attitude", shown(self.quaternion))
         position = per_row(self.position, "goal.position", dims, space_of(dims, "goal"))
         check_finite(position, "goal.position")
         return Goal(position.contiguous(), self._bound_radius(dims), self.required)
@@ -79,12 +88,28 @@ class Goal(PerElement):
         free = torch.isnan(state)
         if bool(torch.isinf(state).any() | (free != free[:1]).any() | free.all()):
             raise InputError("goal.state", "finite numbers, NaN in the same components of all problems", state.tolist())
+        quaternion = self._attitude(state, dims.n)
         if dims.position is None:
             return None
         if bool(free[:, dims.position].any()):
             raise InputError("goal.state", "a position that isn't free", "NaN in it")
         radius = dims.like.new_full((dims.B,), ADMITTED) if self.radius is None else self._bound_radius(dims)
-        return Goal(state[:, dims.position].contiguous(), radius, True, state.contiguous())
+        return Goal(state[:, dims.position].contiguous(), radius, True, state.contiguous(), quaternion)
+
+    def _attitude(self, state: Tensor, n: int) -> tuple[int, ...] | None:
+        """Which of the n states are the quaternion, which no problem's state (B, n) leaves free."""
+        if self.quaternion is None:
+            return None
+        try:
+            places = tuple(whole(i) for i in self.quaternion)
+        except TypeError:
+            places = ()
+        if len(set(places)) != 4 or len(places) != 4 or not all(0 <= i < n for i in places):
+            expected = f"four of the states 0..{n - 1}, (w, x, y, z), none twice"
+            raise InputError("goal.quaternion", expected, shown(self.quaternion))
+        if not bool((state[:, places].norm(dim=-1) > 0).all()):
+            raise InputError("goal.state", "a quaternion other than 0 and without NaN", state[:, places].tolist())
+        return places
 
     @property
     def _is_bound(self) -> bool:
@@ -103,7 +128,8 @@ class Goal(PerElement):
             assert bound is not None and dims.position is not None
             components = list(range(dims.n))[dims.position]
             return GoalBall(("x", components), upper=bound.radius, knots=[dims.N], center=bound.position).bind(dims)
-        return GoalState(per_row(self.state, "goal.state", dims, dims.n)).bind(dims)
+        state = per_row(self.state, "goal.state", dims, dims.n)
+        return GoalState(state, quaternion=self._attitude(state, dims.n)).bind(dims)
 
     @classmethod
     def derived(cls, state: Tensor | None, dims: Dimensions) -> Goal | None:
@@ -144,9 +170,14 @@ class GoalBall(NormBounds):
 
 @dataclass(frozen=True)
 class GoalState(Constraint):
-    """The rows x_N - state = 0 of a required goal, of the components that aren't NaN."""
+    """The rows x_N - state = 0 of a required goal, of the components that aren't NaN.
+
+    Of a quaternion q they are 2 g* q / |g| with the goal's conjugate g*, without the scalar part: q = g and q = -g meet
+    them. Nearby they are the rotation from one to the other, rad.
+    """
 
     state: Tensor  # (B, n)
+    quaternion: tuple[int, ...] | None = None
     components: Tensor | None = None  # (c,) int64, once bound
     knots: Any = None
 
@@ -157,11 +188,17 @@ class GoalState(Constraint):
     is_goal: ClassVar[bool] = True
 
     def bind(self, dims: Dimensions) -> Self:
-        components = (~torch.isnan(self.state[0])).nonzero().flatten()
+        stated = ~torch.isnan(self.state[0])
+        if self.quaternion is not None:
+            stated[list(self.quaternion)] = False
+        components = stated.nonzero().flatten()
         return replace(self, components=components, knots=slice(dims.N, dims.N + 1))
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
-        return f"state {self.components.tolist()[row]}"  # type: ignore[union-attr]
+        components: list[int] = self.components.tolist()  # type: ignore[union-attr]
+        if row < len(components):
+            return f"state {components[row]}"
+        return f"rotation about the body's {AXES[row - len(components)]} axis"
 
     def numbers(self, where: str, index: int) -> list[Number]:
         return numbers("goal", {"state": (self.state, self._check_new)}, index)
@@ -173,14 +210,34 @@ class GoalState(Constraint):
 
     def goal(self, before: Goal, position: slice) -> Goal:
         """As of `GoalBall`."""
-        return Goal(self.state[:, position], before.radius.clone(), True, self.state)
+        return Goal(self.state[:, position], before.radius.clone(), True, self.state, self.quaternion)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return X[:, self.knots][..., self.components] - self.state[:, self.components].unsqueeze(1)
+        x = X[:, self.knots]
+        rows = x[..., self.components] - self.state[:, self.components].unsqueeze(1)
+        if self.quaternion is None:
+            return rows
+        q = x[..., list(self.quaternion)].unsqueeze(-2)
+        return torch.cat((rows, (self._turns().unsqueeze(1) * q).sum(-1)), dim=-1)
+
+    def _turns(self) -> Tensor:
+        """The matrices (B, 3, 4) of the rows of the quaternion."""
+        assert self.quaternion is not None
+        w, x, y, z = (2.0 * normalize(self.state[:, list(self.quaternion)], dim=-1)).unbind(-1)
+        rows = (-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w)
+        return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         components, n = self.components, X.shape[-1]
         assert components is not None
+        if self.quaternion is not None:
+            places, turns = torch.tensor(self.quaternion, device=X.device), self._turns()
+            (g, by_turn), (h, weight) = (rows[:, 0].split([len(components), 3], -1) for rows in (g, h))
+            slope = (by_turn.unsqueeze(-2) @ turns).squeeze(-2)
+            H[:, -1, places, n] += slope
+            H[:, -1, n, places] += slope
+            H[:, -1, places.unsqueeze(-1), places] += turns.mT @ (weight.unsqueeze(-1) * turns)
+            g, h = g.unsqueeze(1), h.unsqueeze(1)
         H[:, -1, components, n] += g[:, 0]
         H[:, -1, n, components] += g[:, 0]
         H[:, -1, components, components] += h[:, 0]

@@ -17,9 +17,10 @@ from torch.nn.functional import pad
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_shape, lead
+from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
-from torchgco.constraints.carried import Taken
+from torchgco.constraints.carried import Carrying, Taken
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.dynamics.base import WrappedDynamics
@@ -72,7 +73,7 @@ def states_in_time(problem: Problem, X: Tensor, U: Tensor, factors: Tensor) -> t
     along = factors[:, time.of_stages(N)]
     parts = [X, torch.cat((along, along[:, -1:]), dim=1).unsqueeze(-1)]
     if (carried := carried_of(problem)) is not None:
-        parts.append(carried.along(X, U))
+        parts.append(carried.along(X, U, problem.along, along.unsqueeze(-1)))
     if time.count == 1:
         return torch.cat(parts, dim=-1), U
     later = torch.cat((along[:, 1:], torch.ones_like(along[:, :1])), dim=1)
@@ -208,17 +209,18 @@ def _switches(time: FreeTime, N: int) -> Tensor | None:
 class _Dynamics(WrappedDynamics):
     """A model whose stages last tau dt, with tau among its states."""
 
-    taken: Taken | None  # the further states
+    taken: Carrying | None  # the further states
     switches: Tensor | None  # (N,): 1 at stages whose last control is the next tau
     k: Any = field(default=None, repr=False)  # the stage or the stages (K,), set by `at` where they differ
 
-    batched: ClassVar[tuple[str, ...]] = ("model",)
+    batched: ClassVar[tuple[str, ...]] = ("model", "taken")
 
+    calls_function = property(lambda self: is_users(self.model) or not isinstance(self.taken, Taken | None))
     n = property(lambda self: self.model.n + 1 + len(self.taken or ()))  # type: ignore[assignment]
     m = property(lambda self: self.model.m + (self.switches is not None))  # type: ignore[assignment]
 
     def at(self, k: int | Tensor) -> Self:
-        same = self.switches is None and (self.taken is None or self.taken.stages is None)
+        same = self.switches is None and (self.taken is None or not self.taken.by_stage)
         return self if same else replace(self, k=k)
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
@@ -234,7 +236,7 @@ class _Dynamics(WrappedDynamics):
         ahead = model.settled(INTEGRATORS[model.integrator](rates, x[..., :n], model.dt))
         parts = [ahead, tau if self.switches is None else self._next(tau, u[..., m : m + 1])]
         if self.taken is not None:
-            parts.append(self.taken.after(x[..., :n], v, x[..., n + 1 :], self.k))
+            parts.append(self.taken.after(x[..., :n], v, x[..., n + 1 :], self.k, model, tau))
         return torch.cat(parts, dim=-1)
 
     def _next(self, tau: Tensor, chosen: Tensor) -> Tensor:

@@ -85,6 +85,7 @@ class Problem(Subset):
         dims = self._dimensions(self.x0)
         self._set(dynamics=bound(self.dynamics, dims, "dynamics", Dynamics))
         check_model(self.dynamics, self.x0)
+        dims = replace(dims, model=self.dynamics)
         self._set(cost=bound(self.cost, dims, "cost", Cost))
         goal, dims = bound_goal(self.goal, self.cost, dims)
         self._set(constraints=_all_bound(self.constraints, dims, self.goal))
@@ -111,7 +112,7 @@ class Problem(Subset):
         goal, dt = self.goal and self.goal.place, getattr(model, "dt", None)
         names = tuple(getattr(model, "state_names", ()))
         parts = len(x0), self.N, model.n, model.m, dt, model.position, x0, first, goal, self.horizon, names
-        return Dimensions(*parts, free_time=self.time is not None)
+        return Dimensions(*parts, free_time=self.time is not None, model=model)
 
     def __repr__(self) -> str:
         return summary(self)

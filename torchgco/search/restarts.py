@@ -138,6 +138,12 @@ class Restarts(Solver):
         short = {name: replace(row, starts=0) for name, row in rows.items() if isinstance(row, Tighten)}
         return replace(self, passes=Passes(rows | short))
 
+    def from_guesses(self, problem: Problem) -> Solver:
+        """Without obstacles in a fixed time the same; else the interior point, without a compiler the local solver."""
+        if problem.time is None and not problem.geometric:
+            return self
+        return self.interior if Converge.worth(problem) else replace(self.local, guidance=None)
+
     def horizon(self, problem: Problem) -> Horizon | None:
         """What `Solution.explain` asks of the horizon of a batch of one; see `reach.horizon_of`."""
         return horizon_of(problem)

@@ -308,7 +308,7 @@ class Solver(Brief, Checked):
             able = "interior_point or, without obstacles, gco; or ipopt"
             raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)
         if call.problem is not problem and (carried := carried_of(problem)) is not None:
-            X0 = torch.cat((X0, carried.along(X0, call.U0)), dim=-1)
+            X0 = torch.cat((X0, carried.along(X0, call.U0, problem.along)), dim=-1)
         return replace(call, X0=X0)
 
     def frees_start(self, problem: Problem) -> bool:
@@ -327,6 +327,11 @@ class Solver(Brief, Checked):
 
     def recording(self) -> Solver:
         """The same solver, which keeps a record of what it does, where it can; `Solution.explain` tells it."""
+        return self
+
+    def from_guesses(self, problem: Problem) -> Solver:
+        """What solves the user's problem from each of several guesses: a local solver, after which this one goes on
+        from the best, or this one."""
         return self
 
     def in_closed_loop(self, rounds: int) -> tuple[Solver, Solver]:
