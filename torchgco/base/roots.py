@@ -42,8 +42,8 @@ def root(residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
     """z (..., q) where residual(z) (..., q), which maps each row by itself, is 0; NaN in rows where none is found.
 
     By Newton's method, with halved corrections where it must be. Its first and second derivatives by all that the
-    residual reads are those of the implicit function. Roots that the residual itself asks for, of as many rows, are found
-    together with it.
+    residual reads are those of the implicit function. Roots that the residual itself asks for, of as many rows, are
+    found together with it.
     """
     if _AS_OPERATIONS.get():
         unknown = torch.ops.torchgco.unknown(guess)
