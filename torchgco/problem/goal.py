@@ -199,11 +199,11 @@ def bound_goal(goal: Goal | None, cost: Cost, dims: Dimensions) -> tuple[Goal | 
 
 def released(row: Constraint) -> Constraint:
     """A row of a required ball, whatever form it has, without an end to the ball; any other row itself."""
+    if isinstance(row, GoalBall):
+        return replace(row, upper=torch.full_like(row.upper, torch.inf))
     if not isinstance(row.bare, GoalBall):
         return row
-    if row is row.bare:
-        return replace(row, upper=torch.full_like(row.upper, torch.inf))
-    return replace(row, constraint=released(row.constraint))  # type: ignore[attr-defined]
+    return replace(row, constraint=released(row.constraint))  # type: ignore
 
 
 def without_goal(goal: Goal | None, dims: Dimensions, constraints: Sequence[Constraint]) -> Sequence[Constraint]:
