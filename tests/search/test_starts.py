@@ -23,7 +23,7 @@ from torchgco import (
     presets,
 )
 from torchgco.search import Converge, Solve, Starts
-from torchgco.search.starts import RequireGoal
+from torchgco.search.starts import ReleaseGoal, RequireGoal
 
 D = torch.float64
 ALL = Starts(when="all")
@@ -101,7 +101,7 @@ def test_guesses_differ_by_seed_and_id() -> None:
 def test_nothing_is_done_where_the_first_solve_succeeds() -> None:
     """`gco` has starts for the others alone."""
     problem = bryson_denham()
-    assert presets.gco(problem).passes.steps[-2:] == (Starts(), RequireGoal())
+    assert presets.gco(problem).passes.steps[-3:] == (Starts(), RequireGoal(), ReleaseGoal())
     assert same(torchgco.solve(problem), solved(problem))
     assert not same(torchgco.solve(problem, solver="gco_max"), solved(problem))
 

@@ -113,6 +113,38 @@ def test_all_headings_of_half_a_turn(kind: str, solver: str, seed: int) -> None:
                 )
 
 
+WALLED = [(kind, walls) for kind in ("car", "trailer") for walls in (False, True)]
+
+
+@pytest.mark.parametrize(("kind", "walls"), mostly(WALLED, *WALLED[1:], several=True))
+def test_requiring_the_goal_costs_no_more_than_stating_it(kind: str, walls: bool) -> None:
+    """What reaches the goal without its being required is a plan where it is: these cost up to 2.4 times as much."""
+    stated, required = (turning(kind, headings(17, seed=77), walls, required) for required in (False, True))
+    free, held = (torchgco.solve(problem, verbose=False) for problem in (stated, required))
+    assert bool(judge(stated, free.U).reached.all()) and bool(judge(required, held.U).reached.all())
+    assert held.statuses == [Status.CONVERGED] * 17
+    assert bool((held.cost <= 1.001 * free.cost).all()), (held.cost / free.cost).tolist()
+    one = torch.tensor([2])
+    assert_same_bits(torchgco.solve(required.take(one), ids=one, verbose=False), held.take([2]))
+
+
+def test_nothing_is_released_that_binds_or_was_caught(monkeypatch: pytest.MonkeyPatch) -> None:
+    released: list[int] = []
+    usual = Problem.releasing_goal
+    monkeypatch.setattr(Problem, "releasing_goal", lambda self: released.append(self.B) or usual(self))
+    problem = turning("car", headings(5, 7), required=True)
+    still = replace(
+        problem, cost=QuadraticCost(Q=[0.0] * 4, R=[1.0, 1.0], Qf=[0.0] * 4)
+    )  # its cost leads nowhere: the goal binds
+    assert bool(judge(still, torchgco.solve(still, verbose=False).U).reached.all()) and not released
+    state = replace(problem, goal=Goal(state=[-3.0, 0.0, math.nan, math.nan], required=True))
+    torchgco.solve(state, verbose=False)
+    torchgco.solve(turning("car", headings(5, 7)), verbose=False)
+    assert not released
+    torchgco.solve(problem, verbose=False)
+    assert sum(released) == 5
+
+
 def test_the_rest_of_a_batch_changes_nothing() -> None:
     problem = turning("car", headings(4, 3), walls=True)
     bad = torch.where(torch.arange(4).unsqueeze(-1) == 2, torch.nan, problem.x0)

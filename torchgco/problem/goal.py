@@ -254,6 +254,15 @@ def bound_goal(goal: Goal | None, cost: Cost, dims: Dimensions) -> tuple[Goal | 
     return bound, dims if bound is None else replace(dims, goal=bound.position)
 
 
+def released(row: Constraint) -> Constraint:
+    """A row of a required ball, whatever form it has, without an end to the ball; any other row itself."""
+    if isinstance(row, GoalBall):
+        return replace(row, upper=torch.full_like(row.upper, torch.inf))
+    if not isinstance(row.bare, GoalBall):
+        return row
+    return replace(row, constraint=released(row.constraint))  # type: ignore
+
+
 def without_goal(goal: Goal | None, dims: Dimensions, constraints: Sequence[Constraint]) -> Sequence[Constraint]:
     """Constraints without the rows of a required goal, as they may be those of a problem that is bound.
 

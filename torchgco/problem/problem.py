@@ -25,7 +25,7 @@ from torchgco.problem.border import check_constraints, check_model, kind_of
 from torchgco.problem.free_start import checked_horizon, chooses_position, clear_starts, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given, place, replaced
-from torchgco.problem.goal import Goal, bound_goal, with_goal, without_goal
+from torchgco.problem.goal import Goal, bound_goal, released, with_goal, without_goal
 from torchgco.problem.known import Known
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
 from torchgco.problem.subset import Subset
@@ -300,6 +300,12 @@ class Problem(Subset):
         goal = replace(self.goal, radius=radius, required=True, assumed=False)
         rows = with_goal(goal, self.constraints, self._dimensions(self.x0))
         return self._with({"goal": goal, "constraints": rows}, self.known.of_lifted("with its goal required"))
+
+    def releasing_goal(self) -> Self:
+        """The same problems, in the same form, with a required goal stated but not required, its ball without end."""
+        assert self.goal is not None
+        rows = tuple(map(released, self.constraints))
+        return self._with({"goal": replace(self.goal, required=False), "constraints": rows}, self.known)
 
     def grown(self, by: Tensor) -> Self:
         """The same problems with their obstacles grown by `by` (B,), m."""

@@ -13,7 +13,7 @@ from torchgco.search.converge import Converge
 from torchgco.search.direct import Direct, Join
 from torchgco.search.following import Follow
 from torchgco.search.proposals import PathProposals
-from torchgco.search.starts import RequireGoal, Starts
+from torchgco.search.starts import ReleaseGoal, RequireGoal, Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.table import Row
 
@@ -173,7 +173,8 @@ class Samples(Row):
 class Tighten(Row):
     """The last solve, by the interior point: from the best trajectory.
 
-    Problems that are unsolved, or miss a stated goal, are solved from other guesses, too, and with the goal required.
+    Problems that are unsolved, or miss a stated goal, are solved from other guesses, too, and with the goal required;
+    those with a required goal that doesn't bind, once without it.
 
     Args:
         starts: so many guesses; 0: none, and no goal is required that isn't.
@@ -190,7 +191,7 @@ class Tighten(Row):
 
     @cached_property
     def steps(self) -> tuple[Row, ...]:
-        return Converge(), *((Starts(self.starts), RequireGoal()) if self.starts > 0 else ())
+        return Converge(), *((Starts(self.starts), RequireGoal(), ReleaseGoal()) if self.starts > 0 else ())
 
     @property
     def does(self) -> str:

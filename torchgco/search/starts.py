@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -12,10 +13,11 @@ from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import Count, Positive
 from torchgco.base.status import STOPPED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
-from torchgco.kernels import measured, open_loop
+from torchgco.kernels import is_convex, measured, open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.search.chords import clear_further
 from torchgco.search.converge import Converge, continued, keep_clear, keep_tight, solved_nearby
@@ -24,6 +26,7 @@ from torchgco.search.search import Search
 from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.drawn import KNOTS, STREAM, controls_of, half_ranges
+from torchgco.solvers.ending import STATIONARY
 
 START_ROUNDS = 2  # one guess turns a car round between walls in 2 of 5 cases: all of 8 miss in 1.7 %, of 16 in 0.03 %
 
@@ -161,20 +164,65 @@ class RequireGoal(Row):
         assert near is not None
         within = near - search.interior.admitted(problem)  # by as much a row may be violated
         end = search.again(replace(call, problem=call.problem.requiring_goal(within)))
-        found, given = end.best, call.problem
+        found = end.best
         multipliers = Multipliers(found.multipliers.lam[:-1], found.multipliers.mu)
-        cost, violation = given.cost.total(found.X, found.U), measured(given, found.X, found.U)
-        arrives = (violation <= search.solver.violation_tolerance) & has_arrived(given, found.X)
-        found = Iterate(found.X, found.U, multipliers, cost, violation)
-        best.end.iterations[rows] += end.iterations
-        some = arrives.nonzero().flatten()
-        if some.numel() == 0:
+        _propose(search, rows, call, replace(end, best=replace(found, multipliers=multipliers)))
+
+
+@dataclass(frozen=True)
+class ReleaseGoal(Row):
+    """Solves problems whose required goal doesn't bind without requiring it.
+
+    Where it binds the cost leads out of the goal, and a solve without it ends outside. Where it doesn't, the cost alone
+    holds the end there, but what the row did on the way may have led past a cheaper trajectory. That is the first solve
+    again; where this one had failed, the whole table, as in `RequireGoal`. Those that were caught have been led along
+    ways to the goal. Nothing is solved of convex problems, nor where a state is required, an equality.
+    """
+
+    label: ClassVar[str] = "release_goal"
+    last: ClassVar[bool] = True
+    problems: ClassVar[str] = "never caught, within a required goal that doesn't bind"
+    does: ClassVar[str] = "interior point without the goal required; where the first solve failed, the whole table"
+
+    def run(self, search: Search) -> None:
+        """Solve; see the class."""
+        problem, best, first = search.call.problem, search.best.end.best, search.caught.status
+        goal = problem.goal
+        if search.again is None or search.call.late or goal is None or not goal.required or goal.state is not None:
             return
-        status = torch.full_like(rows[some], int(Status.MAX_ITERATIONS))
-        none = torch.zeros_like(status)
-        start = take(found, some)
-        best.keep(rows[some], SolveEnd(start, start, status, none, none, none))
-        keep_clear(search, rows[some], continued(search.interior, call.take(some), start))
+        if is_convex(problem) or not Converge.worth(problem):
+            return
+        inside = goal.distance(best.X[:, -1, problem.position]) < goal.radius - ADMITTED
+        inside &= (
+            (best.violation <= search.solver.violation_tolerance) & (first != STOPPED) & (first != Status.INVALID_START)
+        )
+        failed, once = ~is_over(first), partial(search.interior.solved, escapes=True)
+        for rows, solves in ((inside & ~failed, once), (inside & failed, search.again)):
+            if (some := rows.nonzero().flatten()).numel() > 0:
+                call = replace(search.call.take(some), callback=None, warm=None)
+                _propose(search, some, call, solves(replace(call, problem=call.problem.releasing_goal())))
+
+
+def _propose(search: Search, rows: Tensor, call: Call, end: SolveEnd) -> None:
+    """Solve on from what has ended, where it alone arrives in the problems of the call or is cheaper by more than a
+    stationary trajectory may leave to save, and keep what is better.
+
+    Its multipliers are of the rows of these problems, those in `rows`.
+    """
+    best, given, found = search.best, call.problem, end.best
+    cost, violation = given.cost.total(found.X, found.U), measured(given, found.X, found.U)
+    arrives = (violation <= search.solver.violation_tolerance) & has_arrived(given, found.X)
+    old = best.end.best.cost[rows]
+    arrives &= (cost < old - STATIONARY * old.abs()) | ~has_arrived(given, best.end.best.X[rows])
+    best.end.iterations[rows] += end.iterations
+    some = arrives.nonzero().flatten()
+    if some.numel() == 0:
+        return
+    status = torch.full_like(rows[some], int(Status.MAX_ITERATIONS))
+    none = torch.zeros_like(status)
+    start = take(replace(found, cost=cost, violation=violation), some)
+    best.keep(rows[some], SolveEnd(start, start, status, none, none, none))
+    keep_clear(search, rows[some], continued(search.interior, call.take(some), start))
 
 
 def _end(problem: Problem, X: Tensor) -> Tensor:
