@@ -224,6 +224,20 @@ def test_a_step_without_a_root_is_not_finite() -> None:
     assert solution.statuses[1].name == "CONVERGED"
 
 
+@pytest.mark.parametrize("native", [pytest.param(True, marks=compiled), False])
+def test_roots_are_found_where_slopes_change(native: bool) -> None:
+    """z^3 + z = x has one root, whose slope grows from 1 to 7 or more on the way from 0."""
+    starts = torch.linspace(-4.0, 4.0, 801).unsqueeze(-1)
+    cubic = lambda x, z, u: (z + 0.0 * u, z**3 + z - x)
+    model = FunctionDynamics(cubic, n=1, m=1, dt=0.1, integrator="euler", algebraic=1)
+    problem = Problem(model, QuadraticCost(Q=[1.0], R=[1.0], Qf=[1.0]), [], starts, N=1)
+    kernels.use_native(native)
+    z = (kernels.open_loop(problem, torch.zeros(801, 1, 1))[:, 1] - starts) / 0.1
+    assert float((z**3 + z - starts).abs().max()) < 1e-12
+    with pytest.raises(InputError, match="algebraic"):
+        replace(model, algebraic=0).algebraic_states(starts, starts)
+
+
 @pytest.mark.parametrize(
     ("change", "word"),
     [

@@ -192,6 +192,8 @@ class FunctionDynamics(Dynamics, named="dynamics"):
 
     def algebraic_states(self, x: Tensor, u: Tensor) -> Tensor:
         """The algebraic states z (..., q) at states x (..., n) with controls u (..., m): where g(x, z, u) = 0."""
+        if not self.algebraic:
+            raise InputError("dynamics.algebraic", "at least 1, for algebraic states", 0)
         guess = x.new_zeros(*x.shape[:-1], self.algebraic)
         return root(lambda z: self._equations(x, z, u)[1], guess)
 
