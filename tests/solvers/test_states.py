@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_refused() -> None:
     solver = presets.gco(SWINGS)
     with pytest.raises(InputError, match=r"^X0"):  # no interior point comes first
         solve(SWINGS, solver=replace(solver, passes=solver.passes.steps[1:]), X0=X0)
-    assert isinstance(solver.passes.steps[-2], Starts)
+    assert any(isinstance(step, Starts) for step in solver.passes.steps)
 
 
 def test_without_native_kernels_they_are_taken_too() -> None:
