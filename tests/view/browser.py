@@ -25,6 +25,9 @@ FLAGS = (
     "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-port=0",
 )  # fmt: skip
+# A view's first picture is drawn, or a message stands in its place.
+_PICTURE, _MESSAGE = (f"document.getElementById('{name}')" for name in ("picture", "message"))
+DRAWN = f"{_PICTURE}?.dataset.ready === 'true' || {_MESSAGE}?.hidden === false"
 PATIENCE = 60.0  # s for a page to be ready on a busy machine
 
 
@@ -132,14 +135,13 @@ class Tab:
             time.sleep(0.02)
         return value
 
-    def open(self, page: Path, fragment: str = "") -> None:
-        """Open a file, and wait for its first picture. The tab comes to the front: others draw nothing."""
+    def open(self, page: Path, fragment: str = "", ready: str = DRAWN) -> None:
+        """Open a file, and wait until it is `ready`. The tab comes to the front: others draw nothing."""
         self.call("Page.bringToFront")
         self.call("Page.navigate", url="about:blank")
         self.wait("location.href === 'about:blank'")
         self.call("Page.navigate", url=page.resolve().as_uri() + fragment)
-        self.wait("document.readyState === 'complete' && (document.getElementById('picture')?.dataset.ready === 'true'"
-                  " || document.getElementById('message')?.hidden === false)")  # fmt: skip
+        self.wait(f"document.readyState === 'complete' && ({ready})")
 
     def size(self, width: int, height: int, scale: float = 1.0) -> None:
         metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}

@@ -17,6 +17,8 @@ from torchgco.experiments.referee.board import leaderboard
 
 ROWS = "[...document.querySelectorAll('section')[0].querySelectorAll('tbody tr')].filter((row) => !row.hidden)"
 
+COUNTED = "document.querySelector('.count')?.textContent"  # by the page's own script
+
 
 @pytest.fixture(scope="module")
 def html(tmp_path_factory: pytest.TempPathFactory) -> str:
@@ -31,7 +33,7 @@ def test_rows_are_sorted_and_filtered(chromium: Callable[[], Tab], html: str, tm
     tab, file = chromium(), tmp_path / "board.html"
     file.write_text(html)
     tab.size(1000, 700)
-    tab.open(file)
+    tab.open(file, ready=COUNTED)
     entries = lambda: tab.evaluate(f"{ROWS}.map((row) => row.cells[1].textContent)")
     assert len(entries()) == 4
     for _ in range(2):
@@ -54,7 +56,7 @@ def test_rows_are_sorted_and_filtered(chromium: Callable[[], Tab], html: str, tm
 def test_the_first_entries_are_shown(chromium: Callable[[], Tab]) -> None:
     tab = chromium()
     tab.size(1200, 800)
-    tab.open(BOARD / "board.html")
+    tab.open(BOARD / "board.html", ready=COUNTED)
     assert tab.evaluate(f"{ROWS}.length") == len((BOARD / "board.csv").read_text().splitlines()) - 1
     tab.click("th:nth-child(3) button")
     assert tab.evaluate("document.querySelector('th:nth-child(3)').ariaSort") == "ascending"
@@ -67,7 +69,7 @@ def test_nothing_runs_even_where_a_text_were_not_escaped(
     """The page's own policy forbids it."""
     tab, file = chromium(), tmp_path / "board.html"
     file.write_text(html.replace("<h1>", f"{HOSTILE}<h1>"))
-    tab.open(file)
+    tab.open(file, ready=COUNTED)
     assert tab.evaluate("document.title") == "Leaderboard"
     assert tab.evaluate(f"document.body.textContent.includes({json.dumps('seen')})")
     assert tab.evaluate("document.querySelector('.count').textContent") == "4 of 4 rows"
