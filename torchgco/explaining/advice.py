@@ -21,7 +21,8 @@ BY_STATUS = {
     "in dynamics, cost and constraints.",
     Status.NOT_POSITIVE_DEFINITE: "A small weight on every control, as R > 0 of a QuadraticCost; bounds, where the "
     "cost may fall without end.",
-    Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or integrator="rk4".',
+    Status.NON_FINITE: 'Another U0, bounds on the controls, a smaller dt, or another integrator: "rk4", for a stiff '
+    'model "radau5".',
     Status.INFEASIBLE: "Another guess U0, {longer}wider bounds; or loosen {row}, to see whether it is what "
     "makes the problem infeasible.",
     Status.TIME_LIMIT: 'A larger max_seconds, or solver="gco_fast".',
