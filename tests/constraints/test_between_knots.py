@@ -57,7 +57,7 @@ def densest(problem: Problem, solution: torchgco.Solution) -> float:
 def test_few_points_keep_nearly_all_of_the_way() -> None:
     left, costs = [], []
     for points in (0, 1, 3, 7):
-        problem, X0 = half_a_turn(*(BetweenKnots(row, POINT, points) for row in RING if points))
+        problem, X0 = half_a_turn(*(BetweenKnots(row, points) for row in RING if points))
         solution = torchgco.solve(problem, solver="interior_point", X0=X0, verbose=False)
         assert solution.statuses[0].name == "CONVERGED"
         left.append(densest(problem, solution))
@@ -76,7 +76,7 @@ def test_bounds_hold_where_states_overshoot() -> None:
     x0, limits = torch.tensor([[1.0, 0.0], [0.8, 0.3]]).double(), ControlBounds(-6.0, 6.0)
     for bound in (StateBounds([-9.0, -1.5], [9.0, 1.5]), NormBounds(("x", [1]), upper=1.5)):
         fastest = []
-        for rows in ([bound], [bound, BetweenKnots(bound, swing, 4)]):
+        for rows in ([bound], [bound, BetweenKnots(bound, 4)]):
             problem = Problem(swing, cost, [limits, *rows], x0, 12)
             solution = torchgco.solve(problem, verbose=False)
             assert [status.name for status in solution.statuses] == ["CONVERGED"] * 2
@@ -90,7 +90,7 @@ def test_bounds_hold_where_states_overshoot() -> None:
 
 @compiled
 def test_c_pytorch_and_free_time() -> None:
-    problem, X0 = half_a_turn(*(BetweenKnots(row, POINT) for row in RING))
+    problem, X0 = half_a_turn(*(BetweenKnots(row) for row in RING))
     in_c = torchgco.solve(problem, solver="interior_point", X0=X0, verbose=False)
     assert float(torchgco.judge(problem, in_c.U).violation) < 1e-3
     rows = problem.constraints[-1].value(in_c.X, in_c.U)
@@ -109,7 +109,7 @@ def test_c_pytorch_and_free_time() -> None:
 
 def test_stages_are_those_that_end_at_the_knots() -> None:
     row = FunctionConstraint(lambda x: x[..., :1], knots=[0, 2, 5])
-    problem, _ = half_a_turn(BetweenKnots(row, POINT, 2))
+    problem, _ = half_a_turn(BetweenKnots(row, 2))
     assert problem.constraints[-1].knots.tolist() == [1, 4]
     assert problem.constraints[-1].value(*problem.at_rest).shape == (1, 2, 2)
 
@@ -117,15 +117,22 @@ def test_stages_are_those_that_end_at_the_knots() -> None:
 @pytest.mark.parametrize(
     ("within", "word"),
     [
-        (BetweenKnots(RING[0], POINT, 0), "points"),
-        (BetweenKnots(RING[0], POINT, 2.5), "points"),  # type: ignore[arg-type]
-        (BetweenKnots(RING[0], None), "model"),
-        (BetweenKnots(RING[0], replace(POINT, integrator="none")), "model"),
-        (BetweenKnots(Spheres([[0.0, 0.0]], [0.1]), POINT), "constraint"),
-        (BetweenKnots(FunctionConstraint(lambda x: x[..., :1], sense="equality"), POINT), "constraint"),
-        (BetweenKnots(3, POINT), "constraint"),
+        (BetweenKnots(RING[0], 0), "points"),
+        (BetweenKnots(RING[0], 2.5), "points"),  # type: ignore[arg-type]
+        (BetweenKnots(ControlBounds(-1.0, 1.0)), "controls"),
+        (BetweenKnots(Spheres([[0.0, 0.0]], [0.1])), "constraint"),
+        (BetweenKnots(FunctionConstraint(lambda x: x[..., :1], sense="equality")), "constraint"),
+        (BetweenKnots(3), "constraint"),
     ],
 )
 def test_wrong_use_is_told(within: BetweenKnots, word: str) -> None:
     with pytest.raises(InputError, match=word):
         half_a_turn(within)
+
+
+def test_the_model_is_the_problems() -> None:
+    problem, _ = half_a_turn(BetweenKnots(RING[0]))
+    other = replace(problem, dynamics=replace(POINT, dt=0.2))
+    assert other.constraints[-1].model.dt == 0.2
+    with pytest.raises(InputError, match="integrates a field"):
+        replace(problem, dynamics=replace(POINT, function=lambda x, u: x, integrator="none"))
