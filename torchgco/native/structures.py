@@ -7,6 +7,7 @@ from enum import IntEnum
 from torch import Tensor
 
 from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
+from torchgco.base.roots import BY_ROUNDING, MOST_EVALUATIONS, SERVES_AGAIN
 from torchgco.base.status import STOPPED, Status
 from torchgco.lagrangian.barrier import FILTERED, GOLDEN, LEAST_SIZE, LONGEST_FALL, NUDGE, ORDINARY, ROUNDINGS
 from torchgco.native.declarations import Header, Structure, defines, enumerations
@@ -37,6 +38,8 @@ CONSTANTS = {
     "COST_ARRAYS": len(Quadratic),
     "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "ORDINARY": ORDINARY, "LEAST_SIZE": LEAST_SIZE,
     "STOPPED": STOPPED,
+    "NEWTON_MOST": MOST_EVALUATIONS, "NEWTON_SERVES_AGAIN": SERVES_AGAIN,
+    "NEWTON_ROUNDED_DOUBLE": (2.0**-52) ** BY_ROUNDING, "NEWTON_ROUNDED_SINGLE": (2.0**-23) ** BY_ROUNDING,
     **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (
         ("MURMUR_1", MURMUR_1), ("MURMUR_2", MURMUR_2), ("WEYL", WEYL),
     )},

@@ -8,12 +8,11 @@
    q is a constant where these functions are called: their loops are short. */
 #pragma once
 #include <stddef.h>
+#include "constants.h"
 #include "functions.h"
 
 #define NEWTON_EPSILON (TGCO_IS_DOUBLE ? 0x1p-52 : 0x1p-23)
-#define NEWTON_BY_ROUNDING (TGCO_IS_DOUBLE ? 0x1.428a2f98d7294p-35 : 0x1.965fea53d6e3ap-16) /* to the power 2/3 */
-#define NEWTON_MOST 60 /* evaluations of the equations after the first */
-#define NEWTON_SERVES_AGAIN 0.1 /* as in base/roots.py */
+#define NEWTON_BY_ROUNDING (TGCO_IS_DOUBLE ? NEWTON_ROUNDED_DOUBLE : NEWTON_ROUNDED_SINGLE)
 #define NEWTON_PIVOT 0.1 /* of a column's largest entry a pivot may be (Duff, Erisman and Reid, Direct Methods, 5.2) */
 
 typedef struct {
