@@ -133,6 +133,7 @@ def test_wrong_use_is_told(within: BetweenKnots, word: str) -> None:
 def test_the_model_is_the_problems() -> None:
     problem, _ = half_a_turn(BetweenKnots(RING[0]))
     other = replace(problem, dynamics=replace(POINT, dt=0.2))
-    assert other.constraints[-1].model.dt == 0.2
+    between_knots = other.constraints[-1]
+    assert isinstance(between_knots, BetweenKnots) and between_knots.model.dt == 0.2
     with pytest.raises(InputError, match="integrates a field"):
         replace(problem, dynamics=replace(POINT, function=lambda x, u: x, integrator="none"))
