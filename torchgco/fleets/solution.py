@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
+from torchgco.base.status import Status
+from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.verdict import FleetVerdict
+from torchgco.fleets.plans import Plans
+from torchgco.fleets.verdict import FleetVerdict, judge_fleet
 from torchgco.solution import Solution
 
 
@@ -19,6 +23,15 @@ class FleetSolution:
     fleet: Fleet
     vehicles: tuple[Solution, ...]
     verdict: FleetVerdict
+
+    @classmethod
+    def of(cls, fleet: Fleet, U: Sequence[Tensor]) -> FleetSolution:
+        """What controls (B, N, m) of each vehicle lead to; statuses say FEASIBLE or MAX_ITERATIONS."""
+        plans = Plans.at_rest(fleet)
+        plans.U = list(U)
+        plans.X = [open_loop(one.dynamics, one.x0, u) for one, u in zip(fleet.members, U, strict=True)]
+        verdict = judge_fleet(fleet, U)
+        return cls(fleet, plans.solutions(fleet, verdict), verdict)
 
     def __len__(self) -> int:
         return len(self.vehicles)
@@ -38,6 +51,15 @@ class FleetSolution:
     def least_distance(self) -> Tensor:
         """The smallest distance of two centres that keep one, between the knots too, (B,), m."""
         return self.verdict.least_distance
+
+    @property
+    def status(self) -> Tensor:
+        """A status for each fleet, (B,): CONVERGED or FEASIBLE where all vehicles are, else that of the first other."""
+        every = torch.stack([one.status for one in self.vehicles], dim=1)
+        lost = (every != int(Status.CONVERGED)) & (every != int(Status.FEASIBLE))
+        first = every.gather(1, lost.long().argmax(1, keepdim=True)).squeeze(1)
+        good = torch.where((every == int(Status.CONVERGED)).all(1), int(Status.CONVERGED), int(Status.FEASIBLE))
+        return torch.where(lost.any(1), first, good)
 
     @property
     def makespan(self) -> Tensor:
