@@ -73,6 +73,6 @@ class FleetSolution:
 
     def __repr__(self) -> str:
         B, V = self.fleet.B, self.fleet.V
-        good, cost = int(self.sound.sum()), self.cost
-        costs = f"{float(cost.min()):g} to {float(cost.max()):g}" if B > 1 else f"{float(cost[0]):g}"
+        good, cost = int(self.sound.sum()), self.cost[torch.isfinite(self.cost)].tolist()
+        costs = " to ".join(f"{value:g}" for value in dict.fromkeys([min(cost), max(cost)])) if cost else "unknown"
         return f"FleetSolution(B={B}, V={V}: {good} sound; cost {costs})"

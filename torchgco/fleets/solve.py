@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base import clock
+from torchgco.base.status import Status
 from torchgco.base.tree import put, take
 from torchgco.fleets.among import Among
 from torchgco.fleets.coming_apart import ComingApart
@@ -33,11 +34,12 @@ class _Best:
     def __init__(self, fleet: Fleet, plans: Plans) -> None:
         self.fleet, self.plans = fleet, plans
         self.verdict = judge_fleet(fleet, plans.U)
+        self.lost = torch.isin(plans.status, torch.tensor([Status.INVALID_START, Status.NON_FINITE])).any(-1)
 
     @property
     def open(self) -> Tensor:
-        """Fleets that aren't sound yet, (b,)."""
-        return (~self.verdict.reached).nonzero().flatten()
+        """Fleets that aren't sound yet, and can be: all of their vehicles have a start and a plan, (b,)."""
+        return (~self.verdict.reached & ~self.lost).nonzero().flatten()
 
     def offer(self, rows: Tensor, plans: Plans) -> None:
         """Keep plans of some fleets where they are better: sound, else closer to that, else cheaper."""

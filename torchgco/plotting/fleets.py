@@ -92,6 +92,8 @@ def _ends(axes: Sequence[Axes], members: Sequence[Problem], drawn: SceneMap) -> 
             if member.goal is not None:
                 ends = member.goal.position[course.b].cpu().numpy()[list(plane)]
                 ax.plot(*ends, marker="*", markersize=8, markerfacecolor=course.colour, **look)
+                near: dict[str, Any] = {"fill": False, "edgecolor": course.colour, "linestyle": "--", "linewidth": 0.8}
+                ax.add_patch(Circle((ends[0], ends[1]), float(member.goal.radius[course.b]), **near))
 
 
 def _colour(v: int, count: int) -> str:
