@@ -17,12 +17,13 @@ from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, bent, in_conflict, late, widths
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
-from torchgco.judging.judge import judge
+from torchgco.kernels import path_clearance
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import library_for
 from torchgco.search.timed import ways_in_time
 from torchgco.search.timed_guesses import guesses_along
 from torchgco.search.timed_scenes import can_search
+from torchgco.solution import Solution
 
 RESTARTS = 3  # of each team
 DELAYS = 0.1, 0.2, 0.4  # of beginning, shares of all stages
@@ -145,12 +146,12 @@ class _Turn:
         for _ in range(1 + REPAIRS):
             own = whose[left]
             solution = SOLVER.solve(self._problem(own, grown[left]), U0[left], X0=X0[left])
-            fine, cost, touch = arrives(self._problem(own), solution.U)
+            fine, touch = arrives(self._problem(own), solution)
             for place, i in enumerate(own.tolist()):
                 c, v = int(self.teams[i]), int(self.vehicles[i])
                 self.run.plans.iterations[c, v] += solution.iterations[place]
-                if fine[place] and cost[place] < self.cost[i]:
-                    self.cost[i] = cost[place]
+                if fine[place] and solution.cost[place] < self.cost[i]:
+                    self.cost[i] = solution.cost[place]
                     self.run.plans.set(v, torch.tensor([c]), solution, torch.tensor([place]))
             again = ~fine & (touch < 0) & (solution.violation <= ADMITTED)
             X0[left], U0[left] = solution.X, solution.U
@@ -160,7 +161,12 @@ class _Turn:
                 break
 
 
-def arrives(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Whether controls are sound, (b,) each; their costs; and by how much they keep from contact, m."""
-    verdict = judge(problem, U)
-    return verdict.reached if states_goal(problem) else verdict.feasible, verdict.cost, verdict.clearance
+def arrives(problem: Problem, found: Solution) -> tuple[Tensor, Tensor]:
+    """Whether solutions are sound, and by how much they keep from contact, m, (b,) each: as solvers see it, as what
+    becomes of the fleet is judged."""
+    clear = path_clearance(problem, found.X, found.U)
+    fine, goal = (found.violation <= ADMITTED) & (clear >= 0), problem.goal
+    if goal is not None and states_goal(problem):
+        away = (found.X[:, -1, problem.position] - goal.position).norm(dim=-1)
+        fine &= away < goal.radius + (ADMITTED if goal.required else 0.0)
+    return fine, clear
