@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 
 
@@ -70,6 +72,11 @@ class FleetSolution:
     def sound(self) -> Tensor:
         """Whether all vehicles are feasible and apart, and have reached the goals that they state, (B,)."""
         return self.verdict.reached
+
+    def arrays(self) -> tuple[Sequence[Problem], list[np.ndarray], list[np.ndarray], np.ndarray]:
+        """Problems, X (B, N+1, n) and U (B, N, m) of each vehicle, and what pairs keep, (V, V): for pictures."""
+        X, U = ([getattr(one, name).detach().numpy() for one in self.vehicles] for name in ("X", "U"))
+        return self.fleet.members, X, U, self.fleet.distances.numpy()
 
     def __repr__(self) -> str:
         B, V = self.fleet.B, self.fleet.V

@@ -65,7 +65,8 @@ def fleet_animation(
         for ax, plane in zip(figure.axes, drawn.planes, strict=True):
             for way, radius, colour in zip(paths, radii, colours, strict=True):
                 ax.plot(*way[: k + 1, plane].T, color=colour, linewidth=1.2, zorder=7)
-                ax.add_patch(Circle(way[k, list(plane)], radius, facecolor=colour, edgecolor="white", zorder=8))
+                x, y = way[k, list(plane)].tolist()
+                ax.add_patch(Circle((x, y), radius, facecolor=colour, edgecolor="white", zorder=8))
         return f"{t[k]:.1f} s"
 
     return write_gif(figure.axes, show, frames_of(len(t), float(t[1])), path, colours)

@@ -46,7 +46,11 @@ class Swaps(Scenario):
     dt: checks.TimeStep = 0.1
 
     model: ClassVar[str | None] = "disc"
-    dimension = 2
+
+    @property
+    def dimension(self) -> int:
+        """2, in the plane."""
+        return 2
 
     def __post_init__(self) -> None:
         check_options(self, "scenario")
@@ -88,7 +92,8 @@ class FleetCircle(Swaps):
     heights: checks.Range | None = None
 
     @property
-    def dimension(self) -> int:  # type: ignore[override]
+    def dimension(self) -> int:
+        """3 where starts have heights."""
         return 2 if self.heights is None else 3
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:

@@ -50,14 +50,9 @@ def _drawings(
         label, one = f"{layouts.name}-{number}", [place]
         found = solution_of(vehicle, layouts.take(one), U[one])
         to_draw[label] = partial(_picture, folder / "figures" / f"{label}.png", found)
-        to_draw[f"{label}.gif"] = partial(fleet_animation, *_drawn(found), folder / "figures" / f"{label}.gif")
+        to_draw[f"{label}.gif"] = partial(fleet_animation, *found.arrays(), folder / "figures" / f"{label}.gif")
     return to_draw
 
 
 def _picture(path: Path, found: FleetSolution) -> None:
-    write(path, lambda file: save(fleet_figure(*_drawn(found), None), file, dpi=110))
-
-
-def _drawn(found: FleetSolution) -> tuple[object, ...]:
-    X, U = ([getattr(one, name).numpy() for one in found] for name in ("X", "U"))
-    return found.fleet.members, X, U, found.fleet.distances.numpy()
+    write(path, lambda file: save(fleet_figure(*found.arrays(), None), file, dpi=110))
