@@ -7,7 +7,7 @@ at a mean speed, with some time more where vehicles wait for each other.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -54,6 +54,8 @@ class Swaps(Scenario):
 
     def __post_init__(self) -> None:
         check_options(self, "scenario")
+        for field in fields(self):
+            object.__setattr__(self, field.name, checks.plain(getattr(self, field.name)))
 
     @property
     def kept(self) -> float:
