@@ -39,9 +39,10 @@ class Prioritised:
         fleet: of which these are.
         forms: of its vehicles.
         of: which of the fleets each team is, (C,).
-        alone: what its vehicles do without the others.
+        alone: what its vehicles do without the others; with `again` what they do now.
         orders: in which its vehicles plan, of each team.
         late: whether the time is over.
+        again: the vehicles in `orders` plan again, among the motions of all others; there are no restarts.
     """
 
     def __init__(
@@ -52,20 +53,24 @@ class Prioritised:
         alone: Plans,
         orders: Sequence[Sequence[int]],
         late: Callable[[], bool] = lambda: False,
+        again: bool = False,
     ) -> None:
         C, V = len(of), fleet.V
         self.fleet, self.forms, self.of, self.alone, self.late = fleet, forms, of, alone, late
         self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
         self.order = [list(order) for order in orders]
-        self.at, self.restarts = [0] * C, [0] * C
+        self.at, self.restarts = [0] * C, [RESTARTS if again else 0] * C
         self.plans = alone.take(torch.arange(C))
-        self.known = torch.zeros(C, V, dtype=torch.bool)
+        self.known = torch.full((C, V), again)
         self.off = alone.X[0].new_zeros(C, V)  # by which paths leave the chords that others know, m
+        if again:
+            each = zip(fleet.members, alone.X, alone.U, strict=True)
+            self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
         self.wide = widths(fleet, in_conflict(fleet, alone))
 
     def run(self) -> Plans:
         """Plans of all teams; vehicles without one are where they would be alone."""
-        while rows := [c for c in range(len(self.of)) if self.at[c] < self.fleet.V]:
+        while rows := [c for c in range(len(self.of)) if self.at[c] < len(self.order[c])]:
             if self.late():
                 break
             turn = {c: self.order[c][self.at[c]] for c in rows}

@@ -98,9 +98,25 @@ def solve_fleet(
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
-    """Offer what sharing the room makes of plans for some fleets, (b,)."""
-    if len(rows) > 0 and not late():
-        best.offer(rows, SharedRoom(best.fleet, forms, rows, plans, late).run())
+    """Offer what sharing the room makes of plans for some fleets, (b,).
+
+    Where some vehicles are left a little too close, each of them plans again among all others.
+    """
+    for again in (True, False):
+        if len(rows) == 0 or late():
+            return
+        plans = SharedRoom(best.fleet, forms, rows, plans, late).run()
+        best.offer(rows, plans)
+        left = (~best.verdict.reached[rows]).nonzero().flatten()
+        if len(left) == 0 or not again:
+            return
+        rows, plans = rows[left], plans.take(left)
+        apart = judge_fleet(best.fleet.take(rows.tolist()), plans.U).apart
+        orders = [(~one).nonzero().flatten().tolist() for one in apart]
+        plans = Prioritised(best.fleet, forms, rows, plans, orders, late, again=True).run()
+        best.offer(rows, plans)
+        kept = best.verdict.reached[rows].nonzero().flatten()
+        rows, plans = rows[kept], plans.take(kept)
 
 
 def _orders(fleet: Fleet, seed: int, number: int) -> list[list[int]]:
