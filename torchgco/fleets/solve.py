@@ -34,7 +34,13 @@ class _Best:
     def __init__(self, fleet: Fleet, plans: Plans) -> None:
         self.fleet, self.plans = fleet, plans
         self.verdict = judge_fleet(fleet, plans.U)
+        self.least = self.costs  # (B, V), of vehicles alone
         self.lost = torch.isin(plans.status, torch.tensor([Status.INVALID_START, Status.NON_FINITE])).any(-1)
+
+    @property
+    def costs(self) -> Tensor:
+        """Of all vehicles, (B, V)."""
+        return torch.stack([one.cost for one in self.verdict.vehicles], dim=1)
 
     @property
     def open(self) -> Tensor:
@@ -94,6 +100,7 @@ def solve_fleet(
                 best.offer(rows, teams.take(torch.arange(i, len(of), ORDERS)))
             rows = rows[best.verdict.reached[rows]]
             _improve(best, forms, rows, best.plans.take(rows), late)
+        _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
@@ -113,10 +120,23 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
         rows, plans = rows[left], plans.take(left)
         apart = judge_fleet(best.fleet.take(rows.tolist()), plans.U).apart
         orders = [(~one).nonzero().flatten().tolist() for one in apart]
-        plans = Prioritised(best.fleet, forms, rows, plans, orders, late, again=True).run()
-        best.offer(rows, plans)
-        kept = best.verdict.reached[rows].nonzero().flatten()
-        rows, plans = rows[kept], plans.take(kept)
+        for turned in (False, True):
+            some = [order[::-1] if turned else order for order in orders]
+            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, again=True).run())
+        rows = rows[best.verdict.reached[rows]]
+        plans = best.plans.take(rows)
+
+
+def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
+    """Where one vehicle pays more for the others than all of these together, it plans again among them."""
+    paid = best.costs - best.least
+    rows = (best.verdict.reached & (2.0 * paid.amax(-1) > paid.sum(-1))).nonzero().flatten()
+    if len(rows) == 0 or late():
+        return
+    before, orders = best.verdict.cost[rows], [[v] for v in paid[rows].argmax(-1).tolist()]
+    best.offer(rows, Prioritised(best.fleet, forms, rows, best.plans.take(rows), orders, late, again=True).run())
+    rows = rows[best.verdict.cost[rows] < before]
+    _improve(best, forms, rows, best.plans.take(rows), late)
 
 
 def _orders(fleet: Fleet, seed: int, number: int) -> list[list[int]]:
