@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchgco import InputError, Layouts
-from torchgco.scenarios import FleetCircle, FleetDoor, FleetForest, Vehicle
+from torchgco import InputError, Layouts, compose
+from torchgco.scenarios import FleetCircle, FleetDoor, FleetForest
 from torchgco.scenarios.fleets import Swaps
 from torchgco.scenarios.layouts import concatenate
 
@@ -44,19 +44,13 @@ def test_goals_lie_on_the_other_side() -> None:
 
 
 def test_a_vehicle_of_a_fleet_has_a_task() -> None:
-    drawn, vehicle = FleetCircle(vehicles=3).draw([0, 1], 0), compose_disc()
+    drawn, vehicle = FleetCircle(vehicles=3).draw([0, 1], 0), compose(["scenario=fleet_circle", "solver=hold"]).vehicle
     whole = vehicle.at_rest(drawn)
     assert whole.start.shape == (2, 3, 4) and (whole.start[..., 2:] == 0).all()
     task = vehicle.task(drawn.of_vehicle(2))
     np.testing.assert_array_equal(task.problem.x0[:, :2].numpy(), drawn.start[:, 2])
     with pytest.raises(InputError, match=r"layouts.apart: expected None: .*of_vehicle"):
         vehicle.task(drawn)
-
-
-def compose_disc() -> Vehicle:
-    from torchgco import compose
-
-    return compose(["scenario=fleet_circle", "solver=hold"]).vehicle
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def vehicle(name: str):
-    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard", "car": "parking"}.get(name, "planar_trap")
-    return compose([f"model={name}", f"scenario={scenario}"]).vehicle
+    own = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard", "car": "parking", "disc": "fleet_door"}
+    return compose([f"model={name}", f"scenario={own.get(name, 'planar_trap')}"]).vehicle
 
 
 def test_public_layouts_make_the_published_problem() -> None:
@@ -69,7 +69,10 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("model=planar scenario=yard", "expected model=unicycle or model=disc, as yard is 2-D with 4 states, got model=planar"),
+        (
+            "model=planar scenario=yard",
+            "expected model=unicycle or model=disc, as yard is 2-D with 4 states, got model=planar",
+        ),
         ("model=unicycle scenario=planar_trap", "model=planar, as planar_trap is 2-D with 6 states, got model=un"),
         (
             "model=quadrotor scenario=yard",
