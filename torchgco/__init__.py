@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchgco import kernels as kernels
 from torchgco import presets, sensitivity
-from torchgco.api import compare, plot, show, solve
+from torchgco.api import animate, compare, plot, show, solve
 from torchgco.base.errors import (
     ContactWarning,
     DeviceWarning,
@@ -99,7 +99,7 @@ __all__ = [  # noqa: RUF022
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
     "solve", "Guess", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
-    "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
+    "LoadedController", "compare", "Solution", "plot", "animate", "show", "Status", "presets",
     "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",

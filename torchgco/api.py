@@ -39,6 +39,7 @@ from torchgco.warned import warn_of
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
     from torchgco.base.html import HtmlPage
@@ -354,6 +355,25 @@ def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[So
     if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
         raise InputError("solution", "a fleet and its solution", type(solution).__name__)
     return fleet.members, solution.vehicles
+
+
+def animate(problem: Problem, solution: Solution, b: int | Sequence[int] = 0) -> FuncAnimation:
+    """A film of trajectories among obstacles, also those that move, at 20 pictures a second in real time.
+
+    A notebook plays it; `.save("way.gif")` writes it, and where ffmpeg is installed `.save("way.mp4")`. In space from
+    above and from the side. Flights of over 12 s are shown faster.
+
+    Args:
+        problem, solution: as solved.
+        b: the place of a problem in the batch, or several among the same obstacles.
+
+    Raises:
+        InputError: a place that isn't there, a solution of other problems, other obstacles, or dynamics without a
+            position in 2-D or 3-D.
+    """
+    from torchgco.plotting.animated import solution_film  # matplotlib takes a second to load
+
+    return solution_film(problem, solution.detach(), b)
 
 
 def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPage:

@@ -71,13 +71,11 @@ class Course:
 def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
     """The figure of `torchgco.plot`; see there."""
     problem = current_problem(problem)
-    check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
-    check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-    courses, unit = _courses(problem, solution, _places(b, problem.B))
+    courses, unit = courses_of(problem, solution, b)
     problem = paced(problem, solution.times)
     position = problem.dynamics.position
     planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start, ())
-    shared = [courses] if _is_shared(problem, courses) else [[course] for course in courses]
+    shared = [courses] if is_shared(problem, courses) else [[course] for course in courses]
     maps = [SceneMap.of(problem, group, planes) for group in shared] if planes else []
     rows = ceil((problem.n + problem.m) / PANELS_ACROSS)
     wide = WIDTH / len(maps) if maps else WIDTH
@@ -109,8 +107,15 @@ def _places(b: Any, B: int) -> list[int]:
     return list(dict.fromkeys(places))
 
 
-def _courses(problem: Problem, solution: Solution, places: list[int]) -> tuple[list[Course], str]:
-    """The trajectories, each up to its own last knot, and the unit of t: s, or knots of a model without time step."""
+def courses_of(problem: Problem, solution: Solution, b: int | Sequence[int] | None) -> tuple[list[Course], str]:
+    """The trajectories, each up to its own last knot, and the unit of t: s, or knots of a model without time step.
+
+    Raises:
+        InputError: a place that isn't there, or a solution of other problems.
+    """
+    check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
+    check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
+    places = _places(b, problem.B)
     try:
         t, unit = times(problem) if solution.times is None else solution.times, "t [s]"
     except InputError:
@@ -149,7 +154,7 @@ def _positions(problem: Problem) -> list[list[int]]:
     return positions
 
 
-def _is_shared(problem: Problem, courses: list[Course]) -> bool:
+def is_shared(problem: Problem, courses: list[Course]) -> bool:
     """Whether one scene serves all: they have the same obstacles and goals."""
     rows = torch.tensor([course.b for course in courses], device=problem.x0.device)
     cores = [obstacles.inscribed for obstacles in problem.obstacles]  # all problems have the same body

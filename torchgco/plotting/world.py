@@ -70,8 +70,8 @@ def world_of(problem: Problem, b: int) -> World:
     return World(tuple(scenes), tuple(others), tuple(single.obstacles), body_of(single))
 
 
-def distances(part: Obstacles, box: np.ndarray, plane: Plane, z: float) -> tuple[np.ndarray, ...]:
-    """Grids (V, W) of two coordinates in a plane, m, and the least signed distance there from obstacles at t = 0.
+def distances(part: Obstacles, box: np.ndarray, plane: Plane, z: float, t: float = 0.0) -> tuple[np.ndarray, ...]:
+    """Grids (V, W) of two coordinates in a plane, m, and the least signed distance there from obstacles at t, s.
 
     Args:
         box: corners (2, 2), m, of what is seen of the plane.
@@ -84,6 +84,6 @@ def distances(part: Obstacles, box: np.ndarray, plane: Plane, z: float) -> tuple
     points = np.full((x.size, part.position.stop - part.position.start), z)
     points[:, plane[0]], points[:, plane[1]] = x.ravel(), y.ravel()
     p = torch.as_tensor(points, dtype=like.dtype, device=like.device).unsqueeze(0)
-    apart = part.signed_distance(p, p.new_zeros(p.shape[1]))[0]
+    apart = part.signed_distance(p, p.new_full((p.shape[1],), t))[0]
     least = apart.amin(-1) if apart.shape[-1] else torch.full_like(p[0, :, 0], torch.inf)
     return x, y, least.cpu().numpy().reshape(x.shape)

@@ -1,0 +1,113 @@
+"""Solutions as films: mp4, gif, or in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from matplotlib.animation import FuncAnimation
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+
+from torchgco.base.errors import InputError
+from torchgco.plotting.animation import PALE
+from torchgco.plotting.bodies import ABOVE, SIDE, Plane
+from torchgco.plotting.layouts import ROCK
+from torchgco.plotting.problems import WIDTH, Course, SceneMap, courses_of, is_shared
+from torchgco.plotting.silhouettes import silhouettes
+from torchgco.plotting.style import INK, TITLE
+from torchgco.plotting.world import World, distances
+from torchgco.problem.in_time import paced
+from torchgco.problem.problem import Problem, current_problem
+from torchgco.solution import Solution
+
+FPS = 20
+MAX_FRAMES = 240  # longer flights are shown faster
+
+
+class Film(FuncAnimation):
+    """An animation that notebooks play."""
+
+    def _repr_html_(self) -> str:
+        return self.to_jshtml()
+
+
+def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) -> Film:
+    """The film of `torchgco.animate`; see there."""
+    problem = current_problem(problem)
+    courses, _ = courses_of(problem, solution, b)
+    position = problem.dynamics.position
+    planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start)
+    if planes is None:
+        raise InputError("problem", "dynamics with a position in 2-D or 3-D", type(problem.dynamics).__name__)
+    if not is_shared(problem, courses):
+        raise InputError("b", "problems among the same obstacles", b)
+    scene = SceneMap.of(paced(problem, solution.times), courses, planes)
+    figure = Figure(figsize=(WIDTH, scene.height(WIDTH) + 0.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    _at_rest(scene).draw(figure)
+    last = max(float(course.t[-1]) for course in courses)
+    times = np.linspace(0.0, last, min(MAX_FRAMES, max(2, round(FPS * last) + 1)))
+    title = figure.axes[0].set_title("", fontsize=TITLE, loc="left", color=INK)
+    shown = list[Artist]()
+
+    def show(t: float) -> list[Artist]:
+        while shown:
+            shown.pop().remove()
+        title.set_text(f"{t:.1f} s")
+        nominal = scene.world.first.dt * float(np.interp(t, courses[0].t, np.arange(len(courses[0].t))))
+        for ax, plane in zip(figure.axes, planes, strict=True):
+            shown.extend(_moving(ax, scene.world, plane, nominal))
+            for course in courses:
+                shown.extend(_vehicle(ax, scene.world, course, plane, t))
+        return shown
+
+    return Film(figure, show, frames=times.tolist(), interval=1000 * last / (len(times) - 1), cache_frame_data=False)
+
+
+def _at_rest(scene: SceneMap) -> SceneMap:
+    """The scene without what moves, and with pale trajectories."""
+    world = scene.world
+    scenes = [
+        replace(part, bodies=tuple(tuple(body for body in bodies if not body.moving) for bodies in part.bodies))
+        for part in world.scenes
+    ]
+    others = tuple(other for other in world.others if not other.moving)
+    courses = [replace(course, colour=PALE, touches=False) for course in scene.courses]
+    return replace(scene, world=replace(world, scenes=tuple(scenes), others=others, body=None), courses=courses)
+
+
+def _moving(ax: Axes, world: World, plane: Plane, t: float) -> list[Artist]:
+    """What moves, where it is at t, s, of stages that last dt."""
+    look: dict[str, Any] = {"facecolor": (*to_rgb(ROCK), 0.6), "zorder": 1.0}
+    bodies = [body for scene in world.scenes for body in scene.bodies[0] if body.moving]
+    drawn: list[Artist] = [ax.add_patch(Polygon(body.outline(0.0, plane, t), **look)) for body in bodies]
+    box = np.transpose([ax.get_xlim(), ax.get_ylim()])
+    for other in world.others:
+        if other.moving:
+            x, y, apart = distances(other, box, plane, 0.0, t)
+            drawn.append(ax.contourf(x, y, apart, levels=[-np.inf, 0.0], colors=[ROCK], zorder=1.0))
+    return drawn
+
+
+def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float) -> list[Artist]:
+    """A trajectory up to t, s, and the vehicle there: its body, or a ball of its radius."""
+    past, drawn = course.t <= t, list[Artist]()
+    for path in course.paths:
+        now = np.array([np.interp(t, course.t, path[:, i]) for i in plane])
+        way = np.concatenate((path[past][:, plane], now[None]))
+        drawn += ax.plot(*way.T, color=course.colour, linewidth=1.4, zorder=7)
+        if world.body is None:
+            radius = world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
+            drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
+    if world.body is not None:
+        state = course.X[int(past.sum()) - 1 : int(past.sum())]
+        look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}
+        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in silhouettes(world.body, state, plane)]
+    return drawn
