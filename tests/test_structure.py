@@ -27,7 +27,7 @@ LAYERS = [
     ["view"],
     ["baselines"],
     ["presets"],
-    ["fleets", "guesses", "warned"],
+    ["fleets", "guesses", "tightened", "warned"],
     ["api", "envs"],
     ["compiled"],
     ["export"],

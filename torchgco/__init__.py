@@ -81,6 +81,7 @@ from torchgco.scenarios import Layouts
 from torchgco.search import MultiStart, PathProposals, Restarts
 from torchgco.solution import Solution
 from torchgco.solvers import ILQR, AugmentedLagrangian, InteriorPoint, LineSearch, plan_batch
+from torchgco.tightened import tightened
 
 if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage as HtmlPage
@@ -98,7 +99,7 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "Guess", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
+    "solve", "Guess", "tightened", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
     "Fleet", "FleetSolution", "FleetMPC",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",

@@ -137,3 +137,31 @@ def test_the_model_is_the_problems() -> None:
     assert isinstance(between_knots, BetweenKnots) and between_knots.model.dt == 0.2
     with pytest.raises(InputError, match="integrates a field"):
         replace(problem, dynamics=replace(POINT, function=lambda x, u: x, integrator="none"))
+
+
+@compiled
+def test_tightened_rows_leave_nothing_between_their_points() -> None:
+    problem, X0 = half_a_turn(*(BetweenKnots(row) for row in RING))
+    for stated in (problem, replace(problem, time=FreeTime(0.5, 3.0, weight=0.1))):
+        closer, solution = stated, torchgco.solve(stated, solver="interior_point", X0=X0, verbose=False)
+        within = lambda found, stated=stated: float(
+            torchgco.judge(stated, found.U, times=found.t if stated.time else None).violation_between
+        )
+        cost, left = float(solution.cost), []
+        for _ in range(2):
+            left.append(within(solution))
+            closer = torchgco.tightened(closer, solution)
+            solution = torchgco.solve(closer, solver="interior_point", warm=solution, X0=solution.X, verbose=False)
+            assert solution.statuses[0].name == "CONVERGED"
+        assert left[0] > 1e-3 and left[1] < 0.2 * left[0] and within(solution) < 1e-5
+        assert cost <= float(solution.cost) < 1.01 * cost
+
+
+def test_what_cannot_be_tightened_is_told() -> None:
+    problem, _ = half_a_turn()
+    solution = torchgco.solve(problem, solver="hold", verbose=False)
+    with pytest.raises(InputError, match="BetweenKnots"):
+        torchgco.tightened(problem, solution)
+    other, _ = half_a_turn(BetweenKnots(RING[0]), N=6)
+    with pytest.raises(InputError, match=r"solution\.U"):
+        torchgco.tightened(other, solution)
