@@ -28,7 +28,8 @@ class BetweenKnots(Constraint):
     stages three points left 5 % of the violation that knots alone leave.
 
     Args:
-        constraint: an inequality; it holds within the stages that end at its `knots`, by default all.
+        constraint: an inequality; it holds within the stages that end at its `knots`, by default all, with the numbers
+            of that knot. Rows of states and controls: within the stages of its `knots`.
         points: of each stage, 1 to 32.
 
     Raises:
@@ -40,6 +41,7 @@ class BetweenKnots(Constraint):
     points: int = 3
     model: Any = field(default=None, repr=False, kw_only=True)  # the problem's, once bound, as what follows
     stages: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,)
+    counted: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,): which of the constraint's knots end them
     factor: int | None = field(default=None, repr=False, kw_only=True)  # the state that is the factor of free time
 
     batched: ClassVar[tuple[str, ...]] = ("constraint", "model")
@@ -68,10 +70,9 @@ class BetweenKnots(Constraint):
             raise InputError(
                 "between_knots.constraint", "one that isn't kept between the knots anyway", self.constraint
             )
-        stages = torch.arange(dims.N + 1, device=dims.like.device)[own.knots] - 1
-        stages = stages[stages >= 0]
-        everywhere = replace(constraint, knots=slice(0, dims.N)).bind(dims)
-        return replace(self, constraint=everywhere, model=dims.model, stages=stages)
+        stages = torch.arange(dims.N + 1, device=dims.like.device)[own.knots] - (0 if _of_stages(own) else 1)
+        counted = (stages >= 0).nonzero().flatten()
+        return replace(self, constraint=own, model=dims.model, stages=stages[counted], counted=counted)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         """c (B, K, points p) of the stages, a point after the other."""
@@ -84,7 +85,8 @@ class BetweenKnots(Constraint):
         rows = []
         for i in range(1, self.points + 1):
             x = INTEGRATORS[model.integrator](rates, X[:, :-1, :n], model.dt * i / (self.points + 1))
-            rows.append(self.constraint.value(torch.cat((x, X[:, -1:, :n]), 1), u)[:, self.stages])
+            within = (x, X[:, -1:, :n]) if _of_stages(self.constraint) else (X[:, :1, :n], x)
+            rows.append(self.constraint.value(torch.cat(within, 1), u)[:, self.counted])
         return torch.cat(rows, dim=-1)
 
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
@@ -92,3 +94,8 @@ class BetweenKnots(Constraint):
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return f"row {row} within the stage"
+
+
+def _of_stages(constraint: Any) -> bool:
+    """Whether rows are of a stage's controls, too: their knots are those where stages begin."""
+    return getattr(constraint, "of", "x") == "xu"
