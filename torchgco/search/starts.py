@@ -18,7 +18,6 @@ from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goal
 from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
 from torchgco.search.chords import clear_further
 from torchgco.search.converge import Converge, continued, keep_clear, keep_tight, solved_nearby
@@ -199,7 +198,7 @@ class ReleaseGoal(Row):
             (best.violation <= search.solver.violation_tolerance) & (first != STOPPED) & (first != Status.INVALID_START)
         )
         failed, once = ~is_over(first), partial(search.interior.solved, escapes=True)
-        drawn = inside | _draws_in(problem, goal, best.X[:, -1])
+        drawn = inside | _draws_in(problem, best.X[:, -1])
         for rows, solves in ((drawn & ~failed, once), (inside & failed, search.again)):
             rows = rows & served
             if (some := rows.nonzero().flatten()).numel() > 0:
@@ -207,9 +206,10 @@ class ReleaseGoal(Row):
                 _propose(search, some, call, solves(replace(call, problem=call.problem.releasing_goal())))
 
 
-def _draws_in(problem: Problem, goal: Goal, x: Tensor) -> Tensor:
+def _draws_in(problem: Problem, x: Tensor) -> Tensor:
     """Whether the terminal cost of states x (B, n) is less with their position at the goal's centre, (B,) bool."""
-    centred = x.clone()
+    goal, centred = problem.goal, x.clone()
+    assert goal is not None
     centred[:, problem.position] = goal.position
     return problem.cost.terminal(centred) < problem.cost.terminal(x)
 
