@@ -88,10 +88,15 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None
     times = None if solution.times is None else solution.times[rows]
     found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
     long = found.large.nonzero().flatten().tolist()
-    if long:
-        warnings.warn(
-            f"{len(long)} of {problem.B} trajectories take steps that are too long for their model: problem "
-            f"{int(rows[long[0]])}, where {found.told(long[0], problem)}; a smaller dt shows what is true",
-            StepWarning,
-            stacklevel=4,
+    if not long:
+        return
+    b, count = long[0], f"{len(long)} of {problem.B} trajectories"
+    told = f"{count} take steps that are too long for their model: problem {int(rows[b])}, where {found.told(b, part)}"
+    better = "a smaller dt"
+    if bool(found.of_cost[long].all()):
+        told = (
+            f"Euler's steps change the costs of {count} by over 1 %: of problem {int(rows[b])} by about "
+            f"{2.0 * float(found.step_cost[b]):.2g} of itself"
         )
+        better = f'integrator="{"rk4" if part.dynamics.integrator == "euler" else "radau5"}", or a smaller dt,'
+    warnings.warn(f"{told}; {better} shows what is true", StepWarning, stacklevel=4)

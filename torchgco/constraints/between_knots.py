@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint, Distance
+from torchgco.constraints.base import Constraint
 from torchgco.dynamics.integrators import INTEGRATORS
 
 MOST_POINTS = 32  # of a stage: each has rows of its own
@@ -33,7 +33,8 @@ class BetweenKnots(Constraint):
     stages three points left 5 % of the violation that knots alone leave.
 
     Args:
-        constraint: an inequality; it holds within the stages that end at its `knots`, by default all.
+        constraint: an inequality; it holds within the stages that end at its `knots`, by default all, with the numbers
+            of that knot. Rows of states and controls: within the stages of its `knots`.
         points: of each stage, 1 to 32.
 
     Raises:
@@ -45,7 +46,8 @@ class BetweenKnots(Constraint):
     points: int = 3
     model: Any = field(default=None, repr=False, kw_only=True)  # the problem's, once bound, as what follows
     stages: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,)
-    margins: Any = field(default=None, repr=False, kw_only=True)  # (B, K, points, p), once bound: see `tightened`
+    margins: Any = field(default=None, repr=False, kw_only=True)  # (B, K, points, p): see `tightened`
+    counted: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,): which of the constraint's knots end them
     factor: int | None = field(default=None, repr=False, kw_only=True)  # the state that is the factor of free time
 
     batched: ClassVar[tuple[str, ...]] = ("constraint", "model", "margins")
@@ -69,20 +71,16 @@ class BetweenKnots(Constraint):
             raise InputError("between_knots.points", f"1 to {MOST_POINTS}", self.points)
         if self.stages is not None:
             return self
-        constraint: Any = self.constraint
-        own = constraint.bind(dims)
-        if isinstance(own, Distance):
+        own: Any = self.constraint.bind(dims)
+        if own.on_its_way:
             raise InputError(
                 "between_knots.constraint", "one that isn't kept between the knots anyway", self.constraint
             )
-        stages = torch.arange(dims.N + 1, device=dims.like.device)[own.knots] - 1
-        stages = stages[stages >= 0]
-        everywhere = replace(constraint, knots=slice(0, dims.N)).bind(dims)
-        rows = everywhere.value(
-            dims.like.unsqueeze(1).expand(-1, dims.N + 1, -1), dims.like.new_zeros(dims.B, dims.N, dims.m)
-        )
-        margins = dims.like.new_zeros(dims.B, len(stages), self.points, rows.shape[-1])
-        return replace(self, constraint=everywhere, model=dims.model, stages=stages, margins=margins)
+        stages = torch.arange(dims.N + 1, device=dims.like.device)[own.knots] - (0 if _of_stages(own) else 1)
+        counted = (stages >= 0).nonzero().flatten()
+        at_rest = dims.like.unsqueeze(1).expand(-1, dims.N + 1, -1), dims.like.new_zeros(dims.B, dims.N, dims.m)
+        margins = dims.like.new_zeros(dims.B, len(counted), self.points, own.value(*at_rest).shape[-1])
+        return replace(self, constraint=own, model=dims.model, stages=stages[counted], counted=counted, margins=margins)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         """c (B, K, points p) of the stages, a point after the other."""
@@ -99,7 +97,8 @@ class BetweenKnots(Constraint):
             tau = X[:, :-1, self.factor : self.factor + 1]
             rates = lambda x: tau * model.field(model.settled(x), u)
         x = INTEGRATORS[model.integrator](rates, X[:, :-1, :n], model.dt * share)
-        return self.constraint.value(torch.cat((x, X[:, -1:, :n]), 1), u)[:, self.stages]
+        within = (x, X[:, -1:, :n]) if _of_stages(self.constraint) else (X[:, :1, :n], x)
+        return self.constraint.value(torch.cat(within, 1), u)[:, self.counted]
 
     def tightened(self, lowered: Self, X: Tensor, U: Tensor) -> Self:
         """The same rows, kept further at points beside a gap in which one is violated, by as much as in that gap.
@@ -126,3 +125,8 @@ class BetweenKnots(Constraint):
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return f"row {row} within the stage"
+
+
+def _of_stages(constraint: Any) -> bool:
+    """Whether rows are of a stage's controls, too: their knots are those where stages begin."""
+    return getattr(constraint, "of", "x") == "xu"
