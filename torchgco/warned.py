@@ -96,7 +96,7 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None
     if bool(found.of_cost[long].all()):
         told = (
             f"Euler's steps change the costs of {count} by over 1 %: of problem {int(rows[b])} by about "
-            f"{2.0 * float(found.step_cost[b]):.2g} of itself"
+            f"{found.cost_told(b, 2.0)}"
         )
         better = f'integrator="{"rk4" if part.dynamics.integrator == "euler" else "radau5"}", or a smaller dt,'
     warnings.warn(f"{told}; {better} shows what is true", StepWarning, stacklevel=4)

@@ -58,10 +58,14 @@ class StepErrors:
         name = f" ({names[where]})" if len(names) else ""
         error, cost = float(self.step_error[b]), float(self.step_cost[b])
         dt = "dt of a stage" if problem.time is not None else f"dt = {problem.dynamics.dt:g} s"
-        more = "" if cost != cost else f", and the cost by {cost:.2g} of itself"
-        more = more if not cost > 10.0 else ", and the cost by many times itself"
+        more = "" if cost != cost else f", and the cost by {self.cost_told(b)}"
         what = f"half of {dt} changes state {where}{name} by {error:.2g} of its range"
         return f"{what} at stage {int(self.stage[b])}{more}"
+
+    def cost_told(self, b: int, times: float = 1.0) -> str:
+        """A multiple of the step cost of problem b in words."""
+        cost = times * float(self.step_cost[b])
+        return "many times itself" if cost > 10.0 else f"{cost:.2g} of itself"
 
 
 def step_errors(
