@@ -52,7 +52,8 @@ def enter(solver: str, families: Sequence[str]) -> None:
     peer = f", CasADi {starts[0]['packages']['casadi']}" if "ipopt" in solver or "fatrop" in solver else ""
     each = "wall time of a batch of 32 divided by its layouts; without set-up and compiling"
     if solver in ACADOS:
-        peer, each = f", acados (comma-deps-acados) {acados.version()}", "processor time of each layout, without set-up and compiling"
+        peer = f", acados (comma-deps-acados) {acados.version()}"
+        each = "processor time of each layout, without set-up and compiling"
     card = {
         "name": NAMES.get(solver, solver),
         "authors": "torchgco",
@@ -137,7 +138,7 @@ def table(path: Path) -> str:
 
 
 main = Command(
-    __doc__, "board", text, "the public layouts, {solvers}", "one thread beside other work",
+    __doc__, "board", text, "the public layouts, {solvers} flown and other entries read", "one thread beside other work",
     families=(list(FAMILIES), "which", list(FAMILIES)), solvers=(list(METHODS), "which", list(METHODS)),
 )  # fmt: skip
 
