@@ -138,7 +138,7 @@ def table(path: Path) -> str:
 
 
 main = Command(
-    __doc__, "board", text, "the public layouts, {solvers} flown and other entries read", "one thread beside other work",
+    __doc__, "board", text, "the public layouts, {solvers} flown, others read", "one thread beside other work",
     families=(list(FAMILIES), "which", list(FAMILIES)), solvers=(list(METHODS), "which", list(METHODS)),
 )  # fmt: skip
 
