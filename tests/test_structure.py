@@ -28,6 +28,7 @@ LAYERS = [
     ["baselines"],
     ["presets"],
     ["fleets", "guesses", "warned"],
+    ["phases"],
     ["api", "envs"],
     ["compiled"],
     ["export"],

@@ -25,6 +25,8 @@ from torchgco.guesses import Guess, guesses_of, solve_guesses
 from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
+from torchgco.phases import Phases, PhasesSolution
+from torchgco.phases.solve import solve_phases
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import guessing_times
@@ -121,6 +123,9 @@ def solve(
             solve has no such argument, or a function that branches on values mixes knots or problems in what is found.
     """
     check_untransformed("solve")
+    if isinstance(problem, Phases):
+        others = {"record": record or None, "smoothing": smoothing, "guesses": guesses, "verbose": verbose or None}
+        return _solve_phases(problem, others | misplaced, solver, (U0, X0), seed, ids, warm, max_seconds)
     if isinstance(problem, Fleet):
         others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing}
         return _solve_fleet(problem, others | {"guesses": guesses, **misplaced}, solver, seed, ids, max_seconds)
@@ -187,6 +192,22 @@ def _solve_fleet(
         return solve(problem, max_seconds=left, verbose=False, **options)
 
     return solve_fleet(fleet, own, seed, ids, "gco" if solver is None else solver, ends)
+
+
+def _solve_phases(
+    phases: Phases,
+    others: Mapping[str, Any],
+    solver: Solver | str | None,
+    guess: tuple[Any, Any],
+    seed: int,
+    ids: Tensor | None,
+    warm: Any,
+    max_seconds: float | None,
+) -> PhasesSolution:
+    if given := [name for name, value in others.items() if value is not None]:
+        raise InputError(f"solve.{given[0]}", "None of phases: they have U0, X0, solver, seed, ids, warm and max_seconds", given[0])
+    made = _solver("interior_point" if solver is None else solver, phases.members[0], False)
+    return solve_phases(phases, made, *guess, seed, ids, warm, max_seconds, _within_bounds)
 
 
 def compare(
@@ -373,19 +394,30 @@ def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPa
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:
-    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows.
+    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows."""
+    with computing_on(problem.x0.device):
+        rest, middle, outside = _at_rest(problem)
+        next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
+        lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)
+        return torch.where(outside.logical_or(lost).view(-1, 1, 1), middle, rest)
+
+
+def _within_bounds(problem: Problem) -> Tensor:
+    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these."""
+    rest, middle, outside = _at_rest(problem)
+    return torch.where(outside.view(-1, 1, 1), middle, rest)
+
+
+def _at_rest(problem: Problem) -> tuple[Tensor, Tensor, Tensor]:
+    """Controls (B, N, m) at rest, those in the middle of their bounds, and where (B,) the former break these.
 
     A bound at infinity has no middle: there the other bound, or rest. Bounds on norms and cones move both inside.
     """
-    with computing_on(problem.x0.device):
-        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        rest = within_norms(rest, problem.constraints)
-        middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
-        for bounds in bounds_of(problem.constraints, "u"):
-            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-            outside[:, bounds.knots] |= (held < lower) | (held > upper)
-            middle[:, bounds.knots] = bounds.middle(held)
-        middle = within_norms(middle, problem.constraints)
-        next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
-        lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)
-        return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)
+    rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+    rest = within_norms(rest, problem.constraints)
+    middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
+    for bounds in bounds_of(problem.constraints, "u"):
+        held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+        outside[:, bounds.knots] |= (held < lower) | (held > upper)
+        middle[:, bounds.knots] = bounds.middle(held)
+    return rest, within_norms(middle, problem.constraints), outside.flatten(1).any(-1)
