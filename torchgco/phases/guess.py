@@ -44,8 +44,7 @@ def guess(whole: Whole, U0: Any, X0: Any, rest: Rest) -> tuple[Tensor, Tensor]:
     """States (B, N+1, n) and controls (B, N, m) of the whole to begin with.
 
     Args:
-        U0, X0: of each phase; None: controls at rest, and states evenly from the phase's start to what is asked of its
-            end, or to where the next phase begins, if nothing changes there.
+        U0, X0: of each phase; None: controls at rest, and states on `_line`.
     """
     controls, states = (per_phase(given, name, whole.phases) for given, name in ((U0, "U0"), (X0, "X0")))
     X, U, n, m = [], [], whole.problem.n, whole.problem.m
@@ -77,11 +76,9 @@ def of_solvers(member: Problem, X: Tensor, U: Tensor, factors: Tensor | None) ->
 
 
 def _line(whole: Whole, i: int) -> Tensor:
-    member = whole.members[i]
-    if i < len(whole.landings) and whole.phases.between[i].function is None:
-        share = torch.linspace(0.0, 1.0, member.N + 1, dtype=member.x0.dtype, device=member.x0.device).view(1, -1, 1)
-        return torch.lerp(member.x0.unsqueeze(1), whole.members[i + 1].x0.unsqueeze(1), share)
-    return straight_line(member)
+    """States evenly from a phase's start to what is asked of its end, near where the next phase begins."""
+    member, after = whole.members[i], whole.members[min(i + 1, len(whole.members) - 1)]
+    return straight_line(member, after.x0 if after is not member and after.n == member.n else None)
 
 
 def _factors(member: Problem, X: Tensor, U: Tensor, has_states: bool) -> Tensor:
