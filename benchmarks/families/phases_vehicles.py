@@ -146,7 +146,7 @@ CAR_LIMITS = 0.05, 4.0
 
 
 def gears(B: int) -> Phases:
-    time = FreeTime(*CAR_LIMITS, weight=1.0)
+    time = FreeTime(*CAR_LIMITS, weight=1.0, guess=1.0)
     problems = []
     for i, (field, x0) in enumerate(zip(CAR_MODELS, CAR_GUESSES, strict=True)):
         rows = [ControlBounds(0.0, 1.0), *([ends([4.0, 0.0], [0, 1])] if i == 3 else [])]
@@ -199,20 +199,20 @@ def cruising(x: Any, u: Any, M: Any) -> Any:
     return 0.1 * x[1], (THRUST * u[0] - drag) / WEIGHT / 100.0
 
 
-AIR_LIMITS = 0.2, 4.0
-LIFT_OFF, CRUISE, ATTACK = 1.2 * STALL / 100.0, 1.6, math.radians(10)
-GENTLE = 0.1  # cost of the squared change of speed by thrust, and of the angle of attack
+AIR_LIMITS = 0.05, 4.0
+LIFT_OFF, CRUISE, ATTACK = 1.2 * STALL / 100.0, 1.8, math.radians(10)
+GENTLE = 10.0, 0.1  # cost of the squared angle of attack, and of the share of thrust in cruise
 
 
 def take_off(B: int) -> Phases:
     time = FreeTime(*AIR_LIMITS, weight=1.0)
     idle = FunctionCost(lambda x, u: u[..., 0] ** 2)
-    effort = FunctionCost(lambda x, u: GENTLE * u[..., 0] ** 2)
+    efforts = [FunctionCost(lambda x, u, by=by: by * u[..., 0] ** 2) for by in GENTLE]
     roll = Problem(model(rolling, 2, 1, 1.0), idle, [ends([LIFT_OFF], [1])], starts([0.0, 0.01], B), 20, time=time)
-    limits = [ControlBounds(-ATTACK, ATTACK), StateBounds([-INF, 0.0, 0.5, -0.3], [INF, INF, INF, 0.3])]
-    climb = Problem(model(climbing, 4, 1, 1.0), effort, [*limits, ends([0.3, 0.0], [1, 3])],
+    limits = [ControlBounds(-ATTACK, ATTACK), StateBounds([-INF, 0.0, 0.5, -0.3], [INF, INF, 1.286, 0.3])]
+    climb = Problem(model(climbing, 4, 1, 1.0), efforts[0], [*limits, ends([0.3, 0.0], [1, 3])],
                     starts([1.2, 0.0, LIFT_OFF, 0.0], B), 30, time=time)  # fmt: skip
-    cruise = Problem(model(cruising, 2, 1, 1.0), effort, [ControlBounds(0.0, 1.0), ends([CRUISE], [1])],
+    cruise = Problem(model(cruising, 2, 1, 1.0), efforts[1], [ControlBounds(0.0, 1.0), ends([CRUISE], [1])],
                      starts([3.0, 1.2], B), 20, time=time)  # fmt: skip
     lift = Jump(lambda x: torch.stack((x[..., 0], 0 * x[..., 0], x[..., 1], 0 * x[..., 0]), -1))
     return Phases([roll, climb, cruise], [lift, Jump(lambda x: x[..., [0, 2]])])
@@ -224,13 +224,13 @@ def take_off_by_hand(guess: Guess) -> Hand:
     hand.cost += 20.0 * a + a * sum(u[0] ** 2 for u in U)
     hand.rows(X[-1][1] - LIFT_OFF)
     Y, V, b = hand.phase(columns(climbing), *guess[1], 1.0, AIR_LIMITS)
-    hand.cost += 30.0 * b + GENTLE * b * sum(v[0] ** 2 for v in V)
+    hand.cost += 30.0 * b + GENTLE[0] * b * sum(v[0] ** 2 for v in V)
     hand.rows(Y[0] - ca.vertcat(X[-1][0], 0.0, X[-1][1], 0.0))
     hand.bound(V, [-ATTACK], [ATTACK])
-    hand.bound(Y[1:], [-INF, 0.0, 0.5, -0.3], [INF, INF, INF, 0.3])
+    hand.bound(Y[1:], [-INF, 0.0, 0.5, -0.3], [INF, INF, 1.286, 0.3])
     hand.rows(Y[-1][[1, 3]] - ca.vertcat(0.3, 0.0))
     Z, W, c = hand.phase(columns(cruising), *guess[2], 1.0, AIR_LIMITS)
-    hand.cost += 20.0 * c + GENTLE * c * sum(w[0] ** 2 for w in W)
+    hand.cost += 20.0 * c + GENTLE[1] * c * sum(w[0] ** 2 for w in W)
     hand.bound(W, [0.0], [1.0])
     hand.rows(Z[0] - Y[-1][[0, 2]])
     hand.rows(Z[-1][1] - CRUISE)

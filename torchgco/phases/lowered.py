@@ -7,9 +7,10 @@ of a jump's stage are the jump's, then the time of the next phase, where that is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from operator import is_
 from typing import Any, ClassVar, Self
 
 import torch
@@ -49,6 +50,10 @@ class Span:
         """Those of a phase."""
         return slice(self.first, self.first + self.N + 1)
 
+    def own(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """A phase's states (B, N+1, n) and controls (B, N, m) among those of the whole."""
+        return X[:, self.knots, : self.n].contiguous(), U[:, self.stages, : self.m].contiguous()
+
 
 @dataclass(frozen=True)
 class Landing(PerElement):
@@ -73,18 +78,19 @@ class Whole:
     """Phases as one problem.
 
     Attributes:
-        forms: the problem of each phase as solvers see it.
+        members: the problem of each phase, with its numbers as they are now.
+        forms: the same as solvers see them.
         landings: the jumps.
         spans: of the phases; of the jumps `spans_between`.
-        problem: all of it.
+        problem: all of it, of which nothing is known yet.
     """
 
-    def __init__(self, phases: Phases, members: Sequence[Problem]) -> None:
-        self.phases, self.members = phases, members
-        self.forms = [for_solvers(one) for one in members]
+    def __init__(self, phases: Phases) -> None:
+        self.phases, self.members = phases, tuple(one.current() for one in phases.members)
+        self.forms = tuple(for_solvers(one) for one in self.members)
         self.landings = tuple(
             Landing(jump, one.time is not None, form.x0[:, one.n + (one.time is not None) :])
-            for jump, one, form in zip(phases.between, members[1:], self.forms[1:], strict=True)
+            for jump, one, form in zip(phases.between, self.members[1:], self.forms[1:], strict=True)
         )
         firsts = [0]
         for form in self.forms:
@@ -94,10 +100,17 @@ class Whole:
             Span(span.first + span.N, 1, span.n, landing.m)
             for span, landing in zip(self.spans, self.landings, strict=False)
         )
+        self.problem = self._problem()
 
-    @cached_property
-    def problem(self) -> Problem:
-        """The problem that solvers are given, kept apart from those of other solves."""
+    @classmethod
+    def current(cls, phases: Phases, before: Whole | None) -> Whole:
+        """Phases with their numbers as they are now, to be solved; of the whole `before` what can't have changed."""
+        members = (one.current() for one in phases.members)
+        whole = copy(before) if before is not None and all(map(is_, members, before.members)) else cls(phases)
+        whole.problem = whole.problem._with({}, Known(current=True))
+        return whole
+
+    def _problem(self) -> Problem:
         first, N = self.forms[0], self.spans[-1].first + self.spans[-1].N
         n, m = (max(sizes) for sizes in zip(*((s.n, s.m) for s in (*self.spans, *self.spans_between)), strict=True))
         more = n - first.n
@@ -110,11 +123,11 @@ class Whole:
                 stretch, tuple(form.dynamics for form in self.forms), self.landings,
                 tuple(form.x0 for form in self.forms),
             ),
-            "cost": _Cost(stretch, tuple(form.cost for form in self.forms), tuple(l.jump for l in self.landings)),
+            "cost": _Cost(stretch, tuple(form.cost for form in self.forms), self.phases.between),
             "constraints": tuple(self._rows(stretch)),
             "goal": None, "horizon": None, "time": None,
         }  # fmt: skip
-        return first._with(parts, Known(current=True))
+        return first._with(parts)
 
     def _rows(self, stretch: Stretch) -> Iterator[Constraint]:
         for form, span in zip(self.forms, self.spans, strict=True):
@@ -203,6 +216,7 @@ class _Cost(Cost):
     batched: ClassVar[tuple[str, ...]] = ("costs", "jumps")
 
     calls_function = property(lambda self: any(map(is_users, (*self.costs, *self.jumps))))
+    reads_knots = property(lambda self: any(cost.reads_knots for cost in self.costs))  # type: ignore[assignment]
 
     def rest_controls(self, like: Tensor) -> Tensor:
         rest = torch.zeros_like(like)
@@ -260,17 +274,14 @@ class PhaseRows(WrappedConstraint):
     bare = property(lambda self: self)  # type: ignore[assignment]
     in_metres = property(lambda self: self.constraint.in_metres)  # type: ignore[assignment]
 
-    def _own(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
-        return X[:, self.span.knots, : self.span.n], U[:, self.span.stages, : self.span.m]
-
     def value(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.value(*self._own(X, U))
+        return self.constraint.value(*self.span.own(X, U))
 
     def violation(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.constraint.violation(*self._own(X, U))
+        return self.constraint.violation(*self.span.own(X, U))
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
-        x, u = self._own(X, U)
+        x, u = self.span.own(X, U)
         n, m, count = self.span.n, self.span.m, X.shape[-1]
         blocks = H.new_zeros(len(H), self.span.N + 1, n + 1 + m, n + 1 + m)
         self.constraint.accumulate(x, u, g, h, blocks)

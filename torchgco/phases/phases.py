@@ -40,6 +40,7 @@ class Phases:
     jumps: Sequence[Jump | Link | None] | None = None
     members: tuple[Problem, ...] = field(init=False, repr=False)
     between: tuple[Jump, ...] = field(init=False, repr=False)  # bound, one fewer
+    derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.problems, Sequence) or not all(isinstance(one, Problem) for one in self.problems):

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchgco.base.status import Status
+from torchgco.base.tree import passed_on
+from torchgco.explaining.account import Account
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.quality import violation
+from torchgco.phases.lowered import Whole
 from torchgco.phases.phases import Phases
+from torchgco.problem.in_time import factors_in, times_of
 from torchgco.solution import Solution
 
 
@@ -19,32 +26,56 @@ from torchgco.solution import Solution
 class PhasesSolution:
     """A `Solution` for each phase, in its own states and controls, and how all of them ended. It has their number.
 
-    A phase's cost, violation and times are its own: it begins at 0 s, and `begins` says when. Status and iterations are
-    those of all phases.
+    Cost, violation and times of `solution[i]` are those of phase i, which begins at 0 s; `begins` says when it does.
+    Status and iterations are those of all phases together.
     """
 
-    phases: Phases
-    parts: tuple[Solution, ...]
-    jumps: tuple[Tensor, ...]  # (B, m) of each jump: its controls
-    cost: Tensor  # (B,): of all phases and jumps
-    violation: Tensor  # (B,): largest of all phases and jumps, metres for lengths
-    status: Tensor  # (B,) int64, see Status
-    iterations: Tensor  # (B,) int64
-    multipliers: Multipliers  # of all rows, as solvers see them: for `warm`
+    whole: Whole
+    found: Solution  # of the problem that solvers were given
+    solver: Any
+
+    cost, violation, status, iterations, statuses = passed_on(
+        "found", "cost", "violation", "status", "iterations", "statuses"
+    )  # (B,) of all phases and jumps: the sum, the largest, metres for lengths, see Status
+
+    @property
+    def phases(self) -> Phases:
+        return self.whole.phases
+
+    @cached_property
+    def parts(self) -> tuple[Solution, ...]:
+        """The solutions of the phases."""
+        return tuple(self._part(i) for i in range(len(self)))
+
+    @cached_property
+    def jumps(self) -> tuple[Tensor, ...]:
+        """The controls (B, m) of each jump."""
+        spans = zip(self.whole.spans_between, self.phases.between, strict=True)
+        return tuple(self.found.U[:, span.first, : jump.controls].contiguous() for span, jump in spans)
+
+    def _part(self, i: int) -> Solution:
+        whole, found = self.whole, self.found
+        member, form, span = whole.members[i], whole.forms[i], whole.spans[i]
+        X, U = span.own(found.X, found.U)
+        first, n, m = sum(len(one.constraints) for one in whole.forms[:i]), member.n, member.m
+        lam = tuple(found.multipliers.lam[first : first + len(member.constraints)])
+        times = None if member.time is None else times_of(member, factors_in(member, X))
+        return replace(
+            found, X=X[..., :n].contiguous(), U=U[..., :m].contiguous(), cost=form.cost.total(X, U),
+            K=found.K[:, span.stages, :m, :n].contiguous(), d=found.d[:, span.stages, :m].contiguous(),
+            multipliers=Multipliers(lam, found.multipliers.mu), violation=violation(form.constraints, X, U),
+            times=times, trace=None, search=None,
+            account=Account(member, self.solver, kernels=found.account and found.account.kernels),
+        )  # fmt: skip
 
     def __len__(self) -> int:
-        return len(self.parts)
+        return len(self.phases)
 
     def __getitem__(self, i: int) -> Solution:
         return self.parts[i]
 
     def __iter__(self) -> Iterator[Solution]:
         return iter(self.parts)
-
-    @property
-    def statuses(self) -> list[Status]:
-        """The statuses by name; `.sentence` explains one."""
-        return [Status(s) for s in self.status.tolist()]
 
     @property
     def begins(self) -> Tensor:
@@ -62,5 +93,5 @@ class PhasesSolution:
         return self.begins[:, -1]
 
     def __repr__(self) -> str:
-        ended = ", ".join(f"{count} {name}" for name, count in Counter(s.name for s in self.statuses).items())
+        ended = ", ".join(f"{count} {Status(s).name}" for s, count in Counter(self.status.tolist()).items())
         return f"PhasesSolution(B={self.phases.B}, {len(self)} phases: {ended})"
