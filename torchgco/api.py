@@ -204,9 +204,14 @@ def _solve_phases(
     warm: Any,
     max_seconds: float | None,
 ) -> PhasesSolution:
+    expected = "None of phases: they have U0, X0, solver, seed, ids, warm and max_seconds"
     if given := [name for name, value in others.items() if value is not None]:
-        raise InputError(f"solve.{given[0]}", "None of phases: they have U0, X0, solver, seed, ids, warm and max_seconds", given[0])
-    made = _solver("interior_point" if solver is None else solver, phases.members[0], False)
+        raise InputError(f"solve.{given[0]}", expected, given[0])
+    if warm is not None and guess != (None, None):
+        raise InputError("warm", "None beside U0 and X0", "a solution")
+    if any(map(asks_for_gradients, phases.members)):
+        raise InputError("phases", "tensors without gradients: solutions of phases have none", "some that ask for them")
+    made = _solver("gco" if solver is None else solver, phases.members[0], False)
     return solve_phases(phases, made, *guess, seed, ids, warm, max_seconds, _within_bounds)
 
 
@@ -358,6 +363,7 @@ def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | 
     """
     if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
         return _fleet_figure(problem, solution, b)
+    problem = current_problem(problem)
     from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
 
     return solution_figure(problem, solution.detach(), b)
@@ -390,6 +396,7 @@ def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPa
 
     if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
         return notebook.show_fleet(*_fleet_of(problem, solution))
+    problem = current_problem(problem)
     return notebook.show(problem, solution.detach())
 
 

@@ -175,6 +175,7 @@ class _Dynamics(Dynamics):
 
     n = property(lambda self: self.stretch.n)  # type: ignore[assignment]
     m = property(lambda self: self.stretch.m)  # type: ignore[assignment]
+    dt = None  # type: ignore[assignment]
     is_integrated = False  # type: ignore[assignment]
     calls_function = property(lambda self: any(map(is_users, (*self.models, *(l.jump for l in self.landings)))))
 
