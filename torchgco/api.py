@@ -211,7 +211,7 @@ def _solve_phases(
         raise InputError("warm", "None beside U0 and X0", "a solution")
     if any(map(asks_for_gradients, phases.members)):
         raise InputError("phases", "tensors without gradients: solutions of phases have none", "some that ask for them")
-    made = _solver("gco" if solver is None else solver, phases.members[0], False)
+    made = _solver("interior_point" if solver is None else solver, phases.members[0], False)
     return solve_phases(phases, made, *guess, seed, ids, warm, max_seconds, _within_bounds)
 
 

@@ -129,11 +129,11 @@ def impulses(B: int) -> Phases:
     burn = Jump(
         lambda x, v: torch.cat((x[..., :2], x[..., 2:] + v), -1), controls=2, cost=lambda x, v: size(v.unbind(-1))
     )
-    orbit, turn = model(orbiting, 4, 1, 0.1), -1.0 / 1.5**0.5
+    orbit = model(orbiting, 4, 1, 0.1)
     wait = Problem(orbit, IDLE, [], starts([1.0, 0.0, 0.0, 1.0], B), 5)
     transfer = Problem(orbit, IDLE, [], starts([0.9, 0.5, -0.5, 1.0], B), 50, time=FreeTime(0.2, 2.0, weight=0.0))
     on_circle = FunctionConstraint(lambda x: torch.stack(circular(x.unbind(-1), torch), -1), "equality", knots=[0])
-    arrived = Problem(orbit, IDLE, [on_circle], starts([-1.3, -0.7, 0.4, turn], B), 5)
+    arrived = Problem(orbit, IDLE, [on_circle], starts([-0.75, 1.3, -0.7, -0.4], B), 5)
     return Phases([wait, transfer, arrived], [burn, burn])
 
 

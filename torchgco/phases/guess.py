@@ -34,9 +34,11 @@ def per_phase(given: Any, field: str, phases: Phases) -> Sequence[Any]:
     if not isinstance(given, Sequence) or len(given) != len(phases):
         got = f"{len(given)} of them" if isinstance(given, Sequence) else shown(given)
         raise InputError(field, f"a list of {len(phases)}, a tensor or None for each phase", got)
-    for one, problem in zip(given, phases.members, strict=True):
-        if one is not None:
-            (problem.check_controls if field == "U0" else lambda X, p=problem: check_states(X, p))(one)
+    for i, (one, problem) in enumerate(zip(given, phases.members, strict=True)):
+        if one is not None and field == "U0":
+            problem.check_controls(one, f"U0[{i}]")
+        elif one is not None:
+            check_states(one, problem, f"X0[{i}]")
     return given
 
 

@@ -61,7 +61,7 @@ class Jump(PerElement):
             if (given := getattr(self, name)) is not None and not callable(given):
                 raise InputError(f"{where}.{name}", "a function, or None", shown(given))
         if self.function is None and before.n != after.n:
-            raise InputError(f"{where}.function", f"a state of {after.n} from one of {before.n}", "None")
+            raise InputError(f"{where}.function", f"a function from {before.n} states to {after.n}", "None")
         if not isinstance(self.constraints, Sequence):
             raise InputError(f"{where}.constraints", "a list of constraints", shown(self.constraints))
         if self.controls == 0 and (self.cost is not None or self.constraints):

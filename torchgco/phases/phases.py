@@ -61,13 +61,16 @@ class Phases:
         return self.members[0].B
 
 
+def _kind(one: Problem) -> tuple[Any, ...]:
+    """What problems of all phases have in common."""
+    return f"a batch of {one.B}", one.x0.dtype, one.x0.device
+
+
 def _check(one: Problem, first: Problem, i: int) -> None:
     where = f"phases.problems[{i}]"
-    for name, mine, theirs in (
-        ("B", one.B, first.B), ("dtype", one.x0.dtype, first.x0.dtype), ("device", one.x0.device, first.x0.device),
-    ):  # fmt: skip
+    for mine, theirs in zip(_kind(one), _kind(first), strict=True):
         if mine != theirs:
-            raise InputError(where, f"{name} {theirs} as of the first phase", mine)
+            raise InputError(where, f"{theirs}, as of the first phase", mine)
     if one.horizon is not None:
         raise InputError(f"{where}.horizon", "None: the N of a phase is that of all problems", "a horizon")
     if i > 0 and one.free_start is not None:
