@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -32,15 +31,6 @@ from torchgco import (
 Field = Callable[[Sequence[Any], Sequence[Any], Any], Sequence[Any]]  # of x, u and the module of functions: x'
 Guess = list[tuple[np.ndarray, np.ndarray, float]]  # of each phase states (N+1, n), controls (N, m) and the factor of time
 NAN, INF = math.nan, math.inf
-
-
-@dataclass(frozen=True)
-class Case:
-    """A problem, its source, and the same by hand from a guess."""
-
-    phases: Callable[[int], Phases]  # of B problems, whose starts differ by up to 1 % in all that isn't 0
-    by_hand: Callable[[Guess], Hand]
-    source: str
 
 
 def model(field: Field, n: int, m: int, dt: float) -> FunctionDynamics:
@@ -88,7 +78,7 @@ def pushed(x: Any, u: Any, M: Any) -> Any:
 
 def ball(B: int) -> Phases:
     fall = Problem(model(falling, 2, 1, 0.025), IDLE, [ends([0.0], [0])], starts([1.0, 0.0], B), 20,
-                   time=FreeTime(0.2, 4.0, weight=0.0))  # fmt: skip
+                   time=FreeTime(0.2, 4.0, weight=0.0, guess=1.0))  # fmt: skip
     push = Problem(model(pushed, 2, 1, 0.452 / 20), FunctionCost(lambda x, u: 0.0226 * u[..., 0] ** 2),
                    [ends([1.0, 1.0], [0, 1]), StateBounds([0.0, -INF], [1.0, INF])], starts([0.0, 2.0], B), 20)  # fmt: skip
     return Phases([fall, push], [Jump(lambda x: torch.stack((x[..., 0], -0.5 * x[..., 1]), -1))])
@@ -131,7 +121,7 @@ def impulses(B: int) -> Phases:
     )
     orbit = model(orbiting, 4, 1, 0.1)
     wait = Problem(orbit, IDLE, [], starts([1.0, 0.0, 0.0, 1.0], B), 5)
-    transfer = Problem(orbit, IDLE, [], starts([0.9, 0.5, -0.5, 1.0], B), 50, time=FreeTime(0.2, 2.0, weight=0.0))
+    transfer = Problem(orbit, IDLE, [], starts([0.9, 0.5, -0.5, 1.0], B), 50, time=FreeTime(0.2, 2.0, weight=0.0, guess=1.0))
     on_circle = FunctionConstraint(lambda x: torch.stack(circular(x.unbind(-1), torch), -1), "equality", knots=[0])
     arrived = Problem(orbit, IDLE, [on_circle], starts([-0.75, 1.3, -0.7, -0.4], B), 5)
     return Phases([wait, transfer, arrived], [burn, burn])
@@ -178,7 +168,7 @@ def orbit_raise(B: int) -> Phases:
         burning, late, [ControlBounds(-DEGREES_90, DEGREES_90), end],
     )  # fmt: skip
     problems = [
-        Problem(model(field, 6, 1, dt), cost, rows, starts(x0, B), 40, time=FreeTime(*limits, weight=0.0))
+        Problem(model(field, 6, 1, dt), cost, rows, starts(x0, B), 40, time=FreeTime(*limits, weight=0.0, guess=1.0))
         for (field, cost, rows), (dt, limits), x0 in zip(kinds, RAISE, guesses, strict=True)
     ]
     return Phases(problems)

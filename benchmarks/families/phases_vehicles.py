@@ -205,7 +205,7 @@ GENTLE = 10.0, 0.1  # cost of the squared angle of attack, and of the share of t
 
 
 def take_off(B: int) -> Phases:
-    time = FreeTime(*AIR_LIMITS, weight=1.0)
+    time = FreeTime(*AIR_LIMITS, weight=1.0, guess=1.0)
     idle = FunctionCost(lambda x, u: u[..., 0] ** 2)
     efforts = [FunctionCost(lambda x, u, by=by: by * u[..., 0] ** 2) for by in GENTLE]
     roll = Problem(model(rolling, 2, 1, 1.0), idle, [ends([LIFT_OFF], [1])], starts([0.0, 0.01], B), 20, time=time)
@@ -264,7 +264,7 @@ def pick_and_place(B: int) -> Phases:
     cost = FunctionCost(lambda x, u: 1e-4 * u.square().sum(-1))
     problems = [
         Problem(model(arm(load), 4, 2, 0.04), cost, [ControlBounds([-t for t in TORQUE], TORQUE), ends(there, range(4))],
-                starts(here, B), 25, time=FreeTime(*ARM_LIMITS, weight=1.0))
+                starts(here, B), 25, time=FreeTime(*ARM_LIMITS, weight=1.0, guess=1.0))
         for load, here, there in zip(ARM_LOADS, ARM_PLACES, ARM_PLACES[1:], strict=False)
     ]  # fmt: skip
     return Phases(problems)
