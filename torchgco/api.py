@@ -74,24 +74,36 @@ def solve(
     max_seconds: float | None = None,
     verbose: bool | None = None,
 ) -> FleetSolution: ...
-
-
+@overload
 def solve(
-    problem: Problem | Fleet,
-    U0: Tensor | None = None,
+    problem: Phases,
+    U0: Sequence[Tensor | None] | None = None,
     solver: Solver | str | None = None,
     seed: int = 0,
     ids: Tensor | None = None,
-    warm: Solution | None = None,
+    warm: PhasesSolution | None = None,
     max_seconds: float | None = None,
-    X0: Tensor | None = None,
+    X0: Sequence[Tensor | None] | None = None,
+    verbose: bool | None = None,
+) -> PhasesSolution: ...
+
+
+def solve(
+    problem: Problem | Fleet | Phases,
+    U0: Any = None,
+    solver: Solver | str | None = None,
+    seed: int = 0,
+    ids: Tensor | None = None,
+    warm: Any = None,
+    max_seconds: float | None = None,
+    X0: Any = None,
     record: bool = False,
     verbose: bool | None = None,
     smoothing: float | None = None,
     guesses: Sequence[Guess | Solution | Mapping[str, Any]] | None = None,
     **misplaced: Never,
-) -> Solution | FleetSolution:
-    """Solve every problem of the batch; of a `Fleet` all vehicles, of which solver, seed, ids and max_seconds are.
+) -> Solution | FleetSolution | PhasesSolution:
+    """Solve every problem of the batch; all vehicles of a `Fleet`; all `Phases`, with a list of U0 and of X0.
 
     A ContactWarning names feasible trajectories that touch an obstacle between knots; a ScaleWarning those with a
     violation that is large beside its row; a StepWarning those with too long a `dt` for the model; a HorizonWarning
@@ -123,12 +135,9 @@ def solve(
             solve has no such argument, or a function that branches on values mixes knots or problems in what is found.
     """
     check_untransformed("solve")
-    if isinstance(problem, Phases):
-        others = {"record": record or None, "smoothing": smoothing, "guesses": guesses, "verbose": verbose or None}
-        return _solve_phases(problem, others | misplaced, solver, (U0, X0), seed, ids, warm, max_seconds)
-    if isinstance(problem, Fleet):
-        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing}
-        return _solve_fleet(problem, others | {"guesses": guesses, **misplaced}, solver, seed, ids, max_seconds)
+    others = {"record": record or None, "smoothing": smoothing, "guesses": guesses, **misplaced}
+    if isinstance(problem, Phases | Fleet):
+        return _solve_parts(problem, others, solver, {"U0": U0, "X0": X0, "warm": warm}, seed, ids, max_seconds)
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
@@ -194,25 +203,26 @@ def _solve_fleet(
     return solve_fleet(fleet, own, seed, ids, "gco" if solver is None else solver, ends)
 
 
-def _solve_phases(
-    phases: Phases,
+def _solve_parts(
+    parts: Phases | Fleet,
     others: Mapping[str, Any],
     solver: Solver | str | None,
-    guess: tuple[Any, Any],
+    guess: dict[str, Any],
     seed: int,
     ids: Tensor | None,
-    warm: Any,
     max_seconds: float | None,
-) -> PhasesSolution:
+) -> PhasesSolution | FleetSolution:
+    if isinstance(parts, Fleet):
+        return _solve_fleet(parts, guess | dict(others), solver, seed, ids, max_seconds)
     expected = "None of phases: they have U0, X0, solver, seed, ids, warm and max_seconds"
     if given := [name for name, value in others.items() if value is not None]:
         raise InputError(f"solve.{given[0]}", expected, given[0])
-    if warm is not None and guess != (None, None):
+    if guess["warm"] is not None and (guess["U0"], guess["X0"]) != (None, None):
         raise InputError("warm", "None beside U0 and X0", "a solution")
-    if any(map(asks_for_gradients, phases.members)):
+    if any(map(asks_for_gradients, parts.members)):
         raise InputError("phases", "tensors without gradients: solutions of phases have none", "some that ask for them")
-    made = _solver("interior_point" if solver is None else solver, phases.members[0], False)
-    return solve_phases(phases, made, *guess, seed, ids, warm, max_seconds, _within_bounds)
+    made = _solver("interior_point" if solver is None else solver, parts.members[0], False)
+    return solve_phases(parts, made, **guess, seed=seed, ids=ids, max_seconds=max_seconds, rest=_within_bounds)
 
 
 def compare(

@@ -9,7 +9,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-8, "ipopt.max_iter": 3000, "ipopt.bound_relax_factor": 0.0}
+OPTIONS = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-8,
+    "ipopt.max_iter": 3000,
+    "ipopt.bound_relax_factor": 0.0,
+}
 
 
 class Hand:

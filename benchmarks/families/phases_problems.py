@@ -5,6 +5,7 @@ Equations of motion are written once, over components that may be PyTorch's or C
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -22,14 +23,15 @@ from torchgco import (
     FunctionCost,
     FunctionDynamics,
     Jump,
-    NormBounds,
     Phases,
     Problem,
     StateBounds,
 )
 
 Field = Callable[[Sequence[Any], Sequence[Any], Any], Sequence[Any]]  # of x, u and the module of functions: x'
-Guess = list[tuple[np.ndarray, np.ndarray, float]]  # of each phase states (N+1, n), controls (N, m) and the factor of time
+Guess = list[
+    tuple[np.ndarray, np.ndarray, float]
+]  # of each phase states (N+1, n), controls (N, m) and the factor of time
 NAN, INF = math.nan, math.inf
 
 
@@ -79,8 +81,9 @@ def pushed(x: Any, u: Any, M: Any) -> Any:
 def ball(B: int) -> Phases:
     fall = Problem(model(falling, 2, 1, 0.025), IDLE, [ends([0.0], [0])], starts([1.0, 0.0], B), 20,
                    time=FreeTime(0.2, 4.0, weight=0.0, guess=1.0))  # fmt: skip
-    push = Problem(model(pushed, 2, 1, 0.452 / 20), FunctionCost(lambda x, u: 0.0226 * u[..., 0] ** 2),
-                   [ends([1.0, 1.0], [0, 1]), StateBounds([0.0, -INF], [1.0, INF])], starts([0.0, 2.0], B), 20)  # fmt: skip
+    effort = FunctionCost(lambda x, u: 0.0226 * u[..., 0] ** 2)
+    rows = [ends([1.0, 1.0], [0, 1]), StateBounds([0.0, -INF], [1.0, INF])]
+    push = Problem(model(pushed, 2, 1, 0.452 / 20), effort, rows, starts([0.0, 2.0], B), 20)
     return Phases([fall, push], [Jump(lambda x: torch.stack((x[..., 0], -0.5 * x[..., 1]), -1))])
 
 
@@ -121,7 +124,9 @@ def impulses(B: int) -> Phases:
     )
     orbit = model(orbiting, 4, 1, 0.1)
     wait = Problem(orbit, IDLE, [], starts([1.0, 0.0, 0.0, 1.0], B), 5)
-    transfer = Problem(orbit, IDLE, [], starts([0.9, 0.5, -0.5, 1.0], B), 50, time=FreeTime(0.2, 2.0, weight=0.0, guess=1.0))
+    transfer = Problem(
+        orbit, IDLE, [], starts([0.9, 0.5, -0.5, 1.0], B), 50, time=FreeTime(0.2, 2.0, weight=0.0, guess=1.0)
+    )
     on_circle = FunctionConstraint(lambda x: torch.stack(circular(x.unbind(-1), torch), -1), "equality", knots=[0])
     arrived = Problem(orbit, IDLE, [on_circle], starts([-0.75, 1.3, -0.7, -0.4], B), 5)
     return Phases([wait, transfer, arrived], [burn, burn])
@@ -134,7 +139,7 @@ def impulses_by_hand(guess: Guess) -> Hand:
         hand.phase(f, *guess[1], 0.1, (0.2, 2.0)),
         hand.phase(f, *guess[2], 0.1),
     ]
-    for (X, _, _), (Y, _, _) in zip(phases, phases[1:], strict=False):
+    for (X, _, _), (Y, _, _) in itertools.pairwise(phases):
         hand.rows(Y[0][:2] - X[-1][:2])
         hand.cost += size(ca.vertsplit(Y[0][2:] - X[-1][2:]))
     hand.cost += sum(u[0] ** 2 for _, U, _ in phases for u in U)

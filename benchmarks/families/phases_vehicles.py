@@ -251,7 +251,12 @@ def arm(load: float) -> Field:
         first = u[0] + tip * s * (2.0 * va * vb + vb * vb) - 9.81 * (1.0 + tip) * M.cos(a) - heavy
         second = u[1] - tip * s * va * va - heavy
         det = inertia[0] * inertia[2] - inertia[1] ** 2
-        return va, vb, (inertia[2] * first - inertia[1] * second) / det, (inertia[0] * second - inertia[1] * first) / det
+        return (
+            va,
+            vb,
+            (inertia[2] * first - inertia[1] * second) / det,
+            (inertia[0] * second - inertia[1] * first) / det,
+        )
 
     return field
 
@@ -262,11 +267,11 @@ ARM_PLACES = [-1.57, 0.0, 0.0, 0.0], [-0.8, 1.6, 0.0, 0.0], [0.6, -1.2, 0.0, 0.0
 
 def pick_and_place(B: int) -> Phases:
     cost = FunctionCost(lambda x, u: 1e-4 * u.square().sum(-1))
+    limits, time = ControlBounds([-t for t in TORQUE], TORQUE), FreeTime(*ARM_LIMITS, weight=1.0, guess=1.0)
     problems = [
-        Problem(model(arm(load), 4, 2, 0.04), cost, [ControlBounds([-t for t in TORQUE], TORQUE), ends(there, range(4))],
-                starts(here, B), 25, time=FreeTime(*ARM_LIMITS, weight=1.0, guess=1.0))
+        Problem(model(arm(load), 4, 2, 0.04), cost, [limits, ends(there, range(4))], starts(here, B), 25, time=time)
         for load, here, there in zip(ARM_LOADS, ARM_PLACES, ARM_PLACES[1:], strict=False)
-    ]  # fmt: skip
+    ]
     return Phases(problems)
 
 

@@ -49,7 +49,9 @@ HEAVY = FunctionDynamics(
 
 
 def to(goal: list[float], **weights: Any) -> QuadraticCost:
-    return QuadraticCost(**{"Q": [0.0] * 4, "R": [0.1, 0.1], "Qf": [50.0, 50, 1, 1], "x_ref": [*goal, 0.0, 0.0]} | weights)
+    return QuadraticCost(
+        **{"Q": [0.0] * 4, "R": [0.1, 0.1], "Qf": [50.0, 50, 1, 1], "x_ref": [*goal, 0.0, 0.0]} | weights
+    )
 
 
 def drive(x0: Any, there: list[float], *rows: Constraint, model: FunctionDynamics = CART, N: int = 15, **more: Any):
@@ -97,7 +99,9 @@ def test_two_impulses_at_free_times_are_hohmanns() -> None:
     first = math.sqrt(2.0 * 1.5 / 2.5) - 1.0
     second = math.sqrt(1.0 / 1.5) - math.sqrt(2.0 / (1.5 * 2.5))
     sizes = [float(v.norm()) for v in solution.jumps]
-    assert sizes == pytest.approx([first, second], abs=1e-4) and float(solution.cost) == pytest.approx(sum(sizes), abs=1e-6)
+    assert sizes == pytest.approx([first, second], abs=1e-4) and float(solution.cost) == pytest.approx(
+        sum(sizes), abs=1e-6
+    )
     assert float(solution[1].duration) == pytest.approx(math.pi * 1.25**1.5, rel=1e-3)
 
 
@@ -204,7 +208,10 @@ def test_numbers_that_change_and_warm_starts() -> None:
 def test_single_precision() -> None:
     starts = torch.zeros(1, 4)
     phases = Phases([drive(starts, [1.0, 0.0]), drive(starts, [2.0, 0.0], model=HEAVY)])
-    solution, double = torchgco.solve(phases), Phases([drive(starts.double(), [1.0, 0.0]), drive(starts.double(), [2.0, 0.0], model=HEAVY)])
+    solution, double = (
+        torchgco.solve(phases),
+        Phases([drive(starts.double(), [1.0, 0.0]), drive(starts.double(), [2.0, 0.0], model=HEAVY)]),
+    )
     assert solution[0].X.dtype == torch.float32 and bool(torchgco.judge(phases, solution).feasible.all())
     torch.testing.assert_close(solution.cost.double(), solved(double).cost, rtol=1e-5, atol=0.0)
 
@@ -223,15 +230,16 @@ def test_slopes_of_rows_are_those_of_autodiff() -> None:
     assert whole.problem.N == 10 and whole.problem.m == 2
 
 
-CARTS = drive([0.0] * 4, [1.0, 0.0])
+HERE = [0.0] * 4
+CARTS = drive(HERE, [1.0, 0.0])
 PAIR = [CARTS, CARTS]
 WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: Phases(CARTS), "phases.problems: expected a list of problems"),
     (lambda: Phases([]), "phases.problems: expected at least one"),
-    (lambda: Phases([CARTS, drive([[0.0] * 4] * 2, [1.0, 0.0])]), r"phases.problems\[1\]: expected a batch of 1"),
+    (lambda: Phases([CARTS, drive([HERE] * 2, [1.0, 0.0])]), r"phases.problems\[1\]: expected a batch of 1"),
     (lambda: Phases([CARTS, drive(torch.zeros(1, 4), [1.0, 0.0])]), r"phases.problems\[1\]: expected torch.float64"),
-    (lambda: Phases([drive([0.0] * 4, [1.0, 0], horizon=torch.tensor([5])), CARTS]), r"problems\[0\].horizon: expected None"),
-    (lambda: Phases([CARTS, drive([0.0] * 4, [1.0, 0], free_start=[True] * 4)]), r"problems\[1\].free_start: expected None"),
+    (lambda: Phases([drive(HERE, [1.0, 0], horizon=torch.tensor([5]))]), r"problems\[0\].horizon: expected None"),
+    (lambda: Phases([CARTS, drive(HERE, [1.0, 0], free_start=[True] * 4)]), r"problems\[1\].free_start: expected None"),
     (lambda: Phases(PAIR, []), "phases.jumps: expected 1, one between two of the 2 phases"),
     (lambda: Phases(PAIR, [3]), r"phases.jumps\[0\]: expected a Jump, a Link or None"),  # type: ignore[list-item]
     (lambda: Phases(PAIR, [Jump(3)]), r"jumps\[0\].function: expected a function"),  # type: ignore[arg-type]
@@ -239,22 +247,25 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: Phases(PAIR, [Jump(lambda x: x + torch.ones(7))]), r"jumps\[0\].function: expected .* RuntimeError"),
     (lambda: Phases(PAIR, [Jump(controls=-1)]), r"jumps\[0\].controls: expected"),
     (lambda: Phases(PAIR, [Jump(cost=lambda x, v: x[..., 0])]), r"jumps\[0\].controls: expected at least 1"),
-    (lambda: Phases(PAIR, [Jump(controls=1, cost=lambda x, v: x)]), r"jumps\[0\].cost: expected values of shape \(1,\)"),
+    (lambda: Phases(PAIR, [Jump(controls=1, cost=lambda x, v: x)]), r"jumps\[0\].cost: .*of shape \(1,\)"),
     (
-        lambda: Phases(PAIR, [Jump(lambda x, v: x, 1, constraints=[StateBounds([0.0] * 4, [1.0] * 4)])]),
+        lambda: Phases(PAIR, [Jump(lambda x, v: x, 1, constraints=[StateBounds(HERE, [1.0] * 4)])]),
         r"jumps\[0\].constraints\[0\]: expected rows of the controls",
     ),
     (lambda: Phases(PAIR, [Jump(lambda x, v: x, 1, constraints=[3])]), r"constraints\[0\]: expected a constraint"),  # type: ignore[list-item]
-    (lambda: Phases(PAIR, [Jump(values={"a": torch.ones(1, dtype=D)})]), r"jumps\[0\].values\['a'\]: expected the name"),
+    (lambda: Phases(PAIR, [Jump(values={"a": torch.ones(1, dtype=D)})]), r"values\['a'\]: expected the name"),
     (lambda: Phases(PAIR, [Link(knots=(0, 3))]), r"jumps\[0\].knots: expected the default"),
-    (lambda: Phases([drive([[0.0] * 4] * 2, [1.0, 0.0])] * 2, [Jump(lambda x: x - x.mean(0))]), r"jumps\[0\].function: .*own row"),
+    (
+        lambda: Phases([drive([HERE] * 2, [1.0, 0.0])] * 2, [Jump(lambda x: x - x.mean(0))]),
+        r"jumps\[0\].function: .*own row",
+    ),
     (lambda: torchgco.solve(Phases(PAIR), U0=[None]), "U0: expected a list of 2"),
     (lambda: torchgco.solve(Phases(PAIR), X0=[torch.zeros(1, 3, 4, dtype=D), None]), r"X0\[0\]: expected shape"),
     (lambda: torchgco.solve(Phases(PAIR), U0=[torch.zeros(1, 3, 2, dtype=D), None]), r"U0\[0\]: expected a tensor"),
     (lambda: torchgco.solve(Phases(PAIR), warm=3), "warm: expected a PhasesSolution"),
     (lambda: torchgco.solve(Phases(PAIR), guesses=[]), "solve.guesses: expected None of phases"),
     (lambda: torchgco.solve(Phases(PAIR), smoothing=0.1), "solve.smoothing: expected None of phases"),
-    (lambda: torchgco.solve(Phases([drive([0.0] * 4, [1.0, 0], time=FreeTime())] * 2), solver="al_ilqr"), "solver: expected"),
+    (lambda: torchgco.solve(Phases([drive(HERE, [1.0, 0], time=FreeTime())]), solver="al_ilqr"), "solver: expected"),
     (lambda: torchgco.compile(Phases(PAIR)), "problem: expected a Problem"),  # type: ignore[arg-type]
     (lambda: torchgco.MPC(Phases(PAIR)), "problem: expected a Problem"),  # type: ignore[arg-type]
     (lambda: torchgco.judge(Phases(PAIR), 3), "solution: expected a PhasesSolution"),  # type: ignore[call-overload]

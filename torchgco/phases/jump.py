@@ -14,7 +14,7 @@ from torchgco.base.options import Natural, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, describe
 from torchgco.base.tree import PerElement
 from torchgco.base.values import NO_VALUES, Values, bound_values
-from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.link import Link
 from torchgco.problem.binding import bound
 from torchgco.problem.joined import mixes_problems
@@ -131,22 +131,8 @@ def linked(link: Link, before: Problem, after: Problem, where: str) -> Jump:
     for problem in (before, after):
         dims = Dimensions(problem.B, 1, problem.n, problem.m, None, None, problem.x0)
         each.append(bound(link, dims, where, Link))
-    components = tuple(row.components for row in each)
-    if len(components[0]) != len(components[1]):
+    first, second = each
+    if len(first.components) != len(second.components):
         expected = f"states that both phases have, of {before.n} and {after.n}"
         raise InputError(f"{where}.components", expected, shown(link.components))
-    function, values = each[0].function, each[0].values
-    assert function is not None
-    rows = _LinkRows(function, link.sense, of="xu", name=link.name, values=values, places=components)
-    return Jump(lambda x, v: v, after.n, constraints=[rows])
-
-
-@dataclass(frozen=True)
-class _LinkRows(FunctionConstraint):
-    """Rows of some components of the states before and after a jump."""
-
-    places: tuple[Tensor, ...] = ()  # of both states which components, (r,) int64
-
-    def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
-        pairs = zip(arguments, self.places, strict=True)
-        return self.values.call(self.function, *(z[..., components] for z, components in pairs))
+    return Jump(lambda x, v: v, after.n, constraints=[first.at_once(second)])

@@ -1,8 +1,8 @@
 """Phases as one problem for solvers: stages of all phases, with one stage for each jump between them.
 
-Its states and controls are as many as the largest phase has; those that a phase lacks are 0. The model, and the cost, of
-a stage are those of its phase, in the form that solvers work on: a free time is a state of the phase's own. The controls
-of a jump's stage are the jump's, then the time of the next phase, where that is free.
+Its states and controls are as many as the largest phase has; those that a phase lacks are 0. A stage has the model and
+the cost of its phase, in the form that solvers work on: a free time is a state of the phase's own. The controls of a
+jump's stage are the jump's, then the time of the next phase, where that is free.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ class _Cost(Cost):
         if jumps:
             cost, jump = self.costs[i], self.jumps[i]
             last = cost.terminal(own) if x.dim() == 2 or k is not None else cost.terminal(own[:, 0]).unsqueeze(1)
-            value = last + jump.costs(x[..., : jump.n], u[..., : jump.controls])
+            value = last if jump.cost is None else last + jump.costs(x[..., : jump.n], u[..., : jump.controls])
         else:
             stages = torch.arange(span.N, device=x.device) if k is None else k - span.first
             value = self.costs[i].stage(own, u[..., : span.m], stages)
@@ -251,7 +251,9 @@ def _shifted(row: Constraint, span: Span, stretch: Stretch) -> Constraint:
     """A phase's constraint in all of it."""
     if isinstance(row, Bounds) and not is_users(row):
         more = (stretch.m if row.of == "u" else stretch.n) - row.lower.shape[-1]
-        sides = {side: pad(getattr(row, side), (0, more), value=free) for side, free in (("lower", -inf), ("upper", inf))}
+        sides = {
+            side: pad(getattr(row, side), (0, more), value=free) for side, free in (("lower", -inf), ("upper", inf))
+        }
         return replace(row, **sides, knots=_later(row.knots, span.first))
     return PhaseRows(row, span)
 

@@ -9,7 +9,6 @@ from typing import Any
 from torchgco.base.errors import InputError, shown
 from torchgco.constraints.link import Link
 from torchgco.costs.base import Cost
-from torchgco.costs.in_free_time import QuadraticInFreeTime
 from torchgco.phases.jump import Jump, linked
 from torchgco.problem.problem import Problem
 
@@ -74,10 +73,9 @@ def _check(one: Problem, first: Problem, i: int) -> None:
     if one.horizon is not None:
         raise InputError(f"{where}.horizon", "None: the N of a phase is that of all problems", "a horizon")
     if i > 0 and one.free_start is not None:
-        raise InputError(f"{where}.free_start", "None but in the first phase: jumps lead to the others", "a free start")
+        raise InputError(f"{where}.free_start", "None: only the first start may be free", "a free start")
     if type(one.cost).total is not Cost.total and not hasattr(one.cost, "diagonal"):
-        if not isinstance(one.cost, QuadraticInFreeTime):
-            raise InputError(f"{where}.cost", "a sum over stages", f"{type(one.cost).__name__}.total")
+        raise InputError(f"{where}.cost", "a sum over stages", f"{type(one.cost).__name__}.total")
 
 
 def _between(jumps: Any, members: tuple[Problem, ...]) -> tuple[Jump, ...]:

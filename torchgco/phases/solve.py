@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import computing_on
+from torchgco.judging.steps import Costates
+from torchgco.kernels import costates
 from torchgco.phases.guess import Rest, guess
-from torchgco.phases.lowered import Whole
+from torchgco.phases.lowered import Span, Whole
 from torchgco.phases.phases import Phases
 from torchgco.phases.solution import PhasesSolution
+from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import CHOOSING_TIME, Solver
 from torchgco.solvers.ending import judged_between
 from torchgco.warned import warn_of
@@ -50,9 +54,21 @@ def solve_phases(
         for form, span in zip(whole.forms, whole.spans, strict=True):
             status = judged_between(form, *span.own(found.X, found.U), status)
         solution = PhasesSolution(whole, replace(found, status=status), solver)
-        for member, part in zip(whole.members, solution, strict=True):
-            warn_of(member, part, False)
+        slopes = cache(lambda: costates(problem, found.X, found.U, found.multipliers.lam))
+        for member, part, span in zip(whole.members, solution, whole.spans, strict=True):
+            warn_of(member, part, False, _costates(member, span, slopes))
         return solution
+
+
+def _costates(member: Problem, span: Span, slopes: Callable[[], Tensor | None]) -> Costates:
+    """Those of a phase among the slopes (B, N+1, n) of all phases; of some problems of the phase."""
+
+    def of(problem: Problem, X: Tensor, U: Tensor, multipliers: Sequence[Tensor]) -> Tensor | None:
+        every = None if member.part_of is not None else slopes()
+        rows = slice(None) if problem.part_of is None else problem.part_of[1]
+        return None if every is None else every[rows, span.knots]
+
+    return of
 
 
 def _warm(whole: Whole, warm: Any) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import computing_on
+from torchgco.base.tree import cast
 from torchgco.constraints.base import ADMITTED
 from torchgco.judging.judge import Verdict, doubled, in_double, judge
 from torchgco.phases.phases import Phases
 from torchgco.phases.solution import PhasesSolution
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
-from torchgco.base.tree import cast
 
 
 @dataclass(frozen=True)

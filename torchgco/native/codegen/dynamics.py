@@ -104,7 +104,9 @@ def trace_dynamics(
     return DynamicsSource(n, m, traced.count, code, **lists, affine=affine, key=parts.key, traced=traced)
 
 
-Step = tuple[list[Any], Any, Sequence[Call]]  # CasADi's columns x (n), u (m), p and w, the next x (n), calls of networks
+Step = tuple[
+    list[Any], Any, Sequence[Call]
+]  # CasADi's columns x (n), u (m), p and w, the next x (n), calls of networks
 
 
 def stepped(traced: Traced, n: int, m: int) -> Step:

@@ -2,8 +2,8 @@
 written for, and C works knot by knot.
 
 Values that PyTorch computes from k (a reference for each knot, say) become the knot's own numbers. Where operations
-differ from knot to knot, too, as in phases with models of their own, each form of a knot has its own code, and the first
-of a knot's numbers says which is its own.
+differ from knot to knot, too, as in phases with a model each, every form of a knot has its own code, and the first of a
+knot's numbers says which it is.
 """
 
 from __future__ import annotations
