@@ -78,6 +78,7 @@ def solve(
 def solve(
     problem: Phases,
     U0: Sequence[Tensor | None] | None = None,
+    *,
     solver: Solver | str | None = None,
     seed: int = 0,
     ids: Tensor | None = None,

@@ -180,7 +180,8 @@ def orbit_raise(B: int) -> Phases:
 
 
 def orbit_raise_by_hand(guess: Guess) -> Hand:
-    hand, end = Hand(), None
+    hand = Hand()
+    end: Any = None
     for i, (field, (dt, limits)) in enumerate(zip((burning, coasting, burning), RAISE, strict=True)):
         start = [1.0, 0.0, 0.0, 1.0, 0.1, 0.0] if i == 0 else None
         X, U, _ = hand.phase(columns(field), *guess[i], dt, limits, start=start)

@@ -100,7 +100,8 @@ def launch(B: int) -> Phases:
 
 
 def launch_by_hand(guess: Guess) -> Hand:
-    hand, end = Hand(), None
+    hand = Hand()
+    end: Any = None
     for i, (thrust, flow, seconds) in enumerate(BURNS):
         f, dt = columns(thrusting(thrust, flow)), seconds / TIME / LAUNCH_STAGES
         X, U, _ = hand.phase(f, *guess[i], dt, (0.5, 1.0) if i == 3 else None, start=PAD if i == 0 else None)
@@ -155,7 +156,8 @@ def gears(B: int) -> Phases:
 
 
 def gears_by_hand(guess: Guess) -> Hand:
-    hand, end = Hand(), None
+    hand = Hand()
+    end: Any = None
     for i, field in enumerate(CAR_MODELS):
         X, U, tau = hand.phase(columns(field), *guess[i], 0.2, CAR_LIMITS, start=CAR_GUESSES[0] if i == 0 else None)
         hand.bound(U, [0.0], [1.0])
@@ -276,7 +278,8 @@ def pick_and_place(B: int) -> Phases:
 
 
 def pick_and_place_by_hand(guess: Guess) -> Hand:
-    hand, end = Hand(), None
+    hand = Hand()
+    end: Any = None
     for i, load in enumerate(ARM_LOADS):
         X, U, tau = hand.phase(columns(arm(load)), *guess[i], 0.04, ARM_LIMITS, start=ARM_PLACES[0] if i == 0 else None)
         hand.bound(U, [-t for t in TORQUE], TORQUE)
