@@ -21,7 +21,9 @@ QUICK = "bouncing ball", "two-burn orbit raise"
 PUBLISHED = {"two-burn orbit raise": (0.3995, 1e-3), "Delta III": (-7.529712, 1e-3)}  # cost, and share for other steps
 
 
-@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES])
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+)
 def test_costs_are_those_of_ipopt_by_hand(name: str) -> None:
     solution, theirs, _ = beside(CASES[name])
     assert theirs.status == "Solve_Succeeded" and solution.statuses == [Status.CONVERGED]

@@ -167,6 +167,26 @@ def test_links_between_phases_leave_the_rest_to_the_solver() -> None:
     assert float((apart[0].X[0, -1, :2] - apart[1].X[0, 0, :2]).norm()) == pytest.approx(0.2, abs=1e-6)
 
 
+def test_a_lap_of_two_phases_is_closed() -> None:
+    """As one problem with a Link is, where both phases have the same model."""
+    wave = 0.2 * torch.arange(25, dtype=D)
+    wanted = torch.stack((wave.sin(), wave.cos(), 0 * wave, 0 * wave), -1)[None]
+    follow = lambda rows, Qf: QuadraticCost(Q=[1.0, 1, 0, 0], R=[0.1, 0.1], Qf=Qf, x_ref=rows)
+    free, none = [True] * 4, [0.0] * 4
+    whole = Problem(CART, follow(wanted, none), [Link()], torch.zeros(1, 4, dtype=D), 24, free_start=free)
+    alone = torchgco.solve(whole, solver="interior_point")
+    parts = [Problem(CART, follow(wanted[:, a : a + 13], none), [], torch.zeros(1, 4, dtype=D), 12, free_start=start)
+             for a, start in ((0, free), (12, None))]  # fmt: skip
+    found = solved(Phases(parts, loop=Link()))
+    torch.testing.assert_close(found.cost, alone.cost, rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(found[0].X[:, 0], found[1].X[:, -1], rtol=0.0, atol=1e-7)
+    assert float(torchgco.judge(Phases(parts, loop=Link(lambda a, b: a - b - 1.0)), found).violation) == pytest.approx(
+        1.0
+    )
+    with pytest.raises(InputError, match="phases.loop: expected a Link"):
+        Phases(parts, loop=3)  # type: ignore[arg-type]
+
+
 def test_a_problem_does_not_depend_on_its_batch() -> None:
     starts = torch.tensor([[0.0, 0, 0, 0], [0.2, 0.3, 0, 0], [-0.5, 0.1, 1, 0]], dtype=D)
     gains = torch.tensor([0.2, 0.5, 0.9], dtype=D)

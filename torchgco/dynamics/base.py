@@ -119,6 +119,10 @@ class WrappedDynamics(Dynamics):
     )
     calls_function = property(lambda self: is_users(self.model))
 
+    def at_rest(self, x0: Tensor, N: int) -> Tensor:
+        n = self.model.n
+        return torch.cat((self.model.at_rest(x0[:, :n], N), repeated(x0[:, n:], N + 1)), dim=-1)
+
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         rates = self.model.field(x[..., : self.model.n], u)
         return torch.nn.functional.pad(rates, (0, self.n - self.model.n))

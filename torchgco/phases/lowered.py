@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, inf
 from torch.nn.functional import pad
 
-from torchgco.base.shapes import repeated
+from torchgco.base.shapes import Dimensions, repeated
 from torchgco.base.tree import PerElement, is_users
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import Bounds
@@ -136,6 +136,15 @@ class Whole:
         for landing, jump, span in zip(self.landings, self.phases.between, self.spans_between, strict=True):
             for row in jump.constraints:
                 yield _shifted(row, replace(span, n=landing.jump.n, m=jump.controls), stretch)
+        if self.phases.loop is not None:
+            x0 = self.members[0].x0
+            dims = Dimensions(len(x0), stretch.N, self._common, stretch.m, None, None, x0)
+            yield self.phases.loop.bind(dims)
+
+    @property
+    def _common(self) -> int:
+        """How many states the first phase and the last one have in common."""
+        return min(self.members[0].n, self.members[-1].n)
 
 
 @dataclass(frozen=True)

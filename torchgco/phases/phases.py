@@ -29,6 +29,8 @@ class Phases:
         problems: one for each phase, each a batch of B. The same object may stand several times.
         jumps: one between two phases each: a `Jump`; a `Link`, whose rows bind the state after it to the state before,
             as the solver chooses the former; or None, as if x+ = x-. None: no state changes between phases.
+        loop: a `Link` between the first state of all and the last one, as in a periodic gait, with `free_start` for what
+            the solver chooses of the first phase's x0.
 
     Raises:
         InputError: no phase, phases with another batch, dtype or device, with a horizon per problem or a cost with a
@@ -37,6 +39,7 @@ class Phases:
 
     problems: Sequence[Problem]
     jumps: Sequence[Jump | Link | None] | None = None
+    loop: Link | None = None
     members: tuple[Problem, ...] = field(init=False, repr=False)
     between: tuple[Jump, ...] = field(init=False, repr=False)  # bound, one fewer
     derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
@@ -50,6 +53,10 @@ class Phases:
             _check(one, self.problems[0], i)
         object.__setattr__(self, "members", tuple(self.problems))
         object.__setattr__(self, "between", _between(self.jumps, self.members))
+        if not isinstance(self.loop, Link | None):
+            raise InputError("phases.loop", "a Link, or None", shown(self.loop))
+        if self.loop is not None:
+            linked(self.loop, self.members[-1], self.members[0], "phases.loop")
 
     def __len__(self) -> int:
         return len(self.members)

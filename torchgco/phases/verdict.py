@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.shapes import computing_on
+from torchgco.base.shapes import Dimensions, computing_on
 from torchgco.base.tree import cast
 from torchgco.constraints.base import ADMITTED
 from torchgco.judging.judge import Verdict, doubled, in_double, judge
@@ -48,7 +48,7 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
     if not isinstance(solution, PhasesSolution) or len(solution) != len(phases):
         raise InputError("solution", f"a PhasesSolution of {len(phases)} phases", shown(solution))
     with computing_on(phases.members[0].x0.device):
-        verdicts, start = list[Verdict](), None
+        verdicts, start, end = list[Verdict](), None, None
         cost = violation = torch.zeros_like(solution.cost, dtype=torch.float64)
         for i, (member, part) in enumerate(zip(phases.members, solution.parts, strict=True)):
             member = in_double(member.current())
@@ -58,12 +58,22 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
                 member = member._with({"x0": start})
             free = part.X[:, 0].double() if member.free_start is not None else None
             verdicts.append(judge(member, U, start=free, times=times))
+            end = _end(member, U, times, member.x0 if free is None else free)
             if i < len(phases.between):
                 jump, v = cast(phases.between[i], torch.float64), doubled(solution.jumps[i], "jumps", member)
-                end = _end(member, U, times, member.x0 if free is None else free)
                 cost, violation = cost + jump.costs(end, v), torch.maximum(violation, jump.violation(end, v))
                 start = jump.after(end, v)
+        if phases.loop is not None and end is not None:
+            violation = torch.maximum(violation, _open(phases, solution[0].X[:, 0].double(), end))
         return _joined(phases, verdicts, cost, violation)
+
+
+def _open(phases: Phases, first: Tensor, last: Tensor) -> Tensor:
+    """By how much a loop isn't closed from the first state (B, n) to the last (B, n'), (B,)."""
+    assert phases.loop is not None
+    n = min(first.shape[-1], last.shape[-1])
+    row = phases.loop.bind(Dimensions(len(first), 1, n, 1, None, None, first))
+    return row.worst(torch.stack((first[:, :n], last[:, :n]), dim=1), first.new_zeros(len(first), 1, 1))
 
 
 def _end(problem: Problem, U: Tensor, times: Tensor | None, start: Tensor) -> Tensor:
