@@ -183,7 +183,7 @@ def test_a_lap_of_two_phases_is_closed() -> None:
     assert float(torchgco.judge(Phases(parts, loop=Link(lambda a, b: a - b - 1.0)), found).violation) == pytest.approx(
         1.0
     )
-    with pytest.raises(InputError, match="phases.loop: expected a Link"):
+    with pytest.raises(InputError, match=r"phases.loop: expected a Link"):
         Phases(parts, loop=3)  # type: ignore[arg-type]
 
 

@@ -29,8 +29,8 @@ class Phases:
         problems: one for each phase, each a batch of B. The same object may stand several times.
         jumps: one between two phases each: a `Jump`; a `Link`, whose rows bind the state after it to the state before,
             as the solver chooses the former; or None, as if x+ = x-. None: no state changes between phases.
-        loop: a `Link` between the first state of all and the last one, as in a periodic gait, with `free_start` for what
-            the solver chooses of the first phase's x0.
+        loop: a `Link` between the first state of all and the last one, as in a periodic gait; `free_start` of the first
+            problem says what the solver chooses there.
 
     Raises:
         InputError: no phase, phases with another batch, dtype or device, with a horizon per problem or a cost with a
