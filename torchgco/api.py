@@ -221,7 +221,8 @@ def _solve_parts(
     if guess["warm"] is not None and (guess["U0"], guess["X0"]) != (None, None):
         raise InputError("warm", "None beside U0 and X0", "a solution")
     if any(map(asks_for_gradients, parts.members)):
-        raise InputError("phases", "tensors without gradients: solutions of phases have none", "some that ask for them")
+        expected = "tensors without gradients, or a call within torch.no_grad(): solutions of phases have none"
+        raise InputError("phases", expected, "some that ask for them")
     made = _solver("interior_point" if solver is None else solver, parts.members[0], False)
     return solve_phases(parts, made, **guess, seed=seed, ids=ids, max_seconds=max_seconds, rest=_within_bounds)
 

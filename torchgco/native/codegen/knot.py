@@ -63,7 +63,7 @@ class KnotSource:
     """C of one knot's rows (size), and where its numbers come from.
 
     `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span`, the
-    numbers that all problems share, and those of the forms, 0, 1, ...
+    numbers 0, 1, ... of the forms, where there are several, and the numbers that all problems share.
     """
 
     code: str
@@ -111,7 +111,8 @@ class KnotSource:
 
     def _fixed(self, traced: Traced, shared: Tensor) -> Tensor:
         """The numbers after a problem's own ones."""
-        return torch.cat((torch.from_numpy(traced.constants), shared, torch.arange(self.forms, dtype=shared.dtype)))
+        forms = torch.arange(self.forms if self.forms > 1 else 0, dtype=shared.dtype)
+        return torch.cat((torch.from_numpy(traced.constants), forms, shared))
 
 
 def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *files: str) -> KnotSource:
@@ -208,11 +209,12 @@ def _knots(span: Span) -> tuple[list[Knot], list[list[int]]]:
     made = [form.made(values, traced.count, span, w) for form in forms]
     if len(made) == 1:
         return [made[0][0]], made[0][1]
-    width = max(len(rows[0]) for _, rows in made)
+    first_shared, width = traced.count + len(traced.constants), max(len(rows[0]) for _, rows in made)
     places: list[list[int]] = [[] for _ in span.knots]
     for number, (form, (_, rows)) in enumerate(zip(forms, made, strict=True)):
         for i, row in zip(form.knots, rows if len(rows) > 1 else rows * len(form.knots), strict=True):
-            places[i] = [len(values) + number, *row, *[len(values)] * (width - len(row))]
+            moved = [slot if slot < first_shared else slot + len(forms) for slot in row]
+            places[i] = [first_shared + number, *moved, *[first_shared] * (width - len(row))]
     return [knot for knot, _ in made], places
 
 
