@@ -153,6 +153,9 @@ def test_goals_and_other_sizes() -> None:
                      time=FreeTime(0.2, 5.0))  # fmt: skip
     found = solved(Phases([first, second], [Jump(lambda x: x[..., [0, 2]])]))
     assert bool(torchgco.judge(first, found[0].U).reached) and found[1].X.shape == (1, 9, 2)
+    for problem, part in zip(found.problems, found, strict=True):
+        certificate = torchgco.certify(problem, part.X, part.U, times=part.times)
+        assert float(certificate.dynamics_residual) < 1e-9 and "CONVERGED" in str(part.explain())
     torch.testing.assert_close(found[1].X[:, -1], torch.full((1, 2), 2.0, dtype=D), rtol=1e-7, atol=1e-7)
 
 

@@ -19,6 +19,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.phases.lowered import Whole
 from torchgco.phases.phases import Phases
 from torchgco.problem.in_time import factors_in, times_of
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 
 
@@ -48,6 +49,14 @@ class PhasesSolution:
         return tuple(self._part(i) for i in range(len(self)))
 
     @cached_property
+    def problems(self) -> tuple[Problem, ...]:
+        """The phases' problems, each with its start that was found: for `plot`, `certify` and tables of one."""
+        first, *others = self.whole.members
+        starts = (self.found.X[:, span.first, : span.n] for span in self.whole.spans[1:])
+        pairs = zip(others, starts, strict=True)
+        return first, *(one._with({"x0": x[:, : one.n].contiguous()}, one.known) for one, x in pairs)
+
+    @cached_property
     def jumps(self) -> tuple[Tensor, ...]:
         """The controls (B, m) of each jump."""
         spans = zip(self.whole.spans_between, self.phases.between, strict=True)
@@ -65,7 +74,7 @@ class PhasesSolution:
             K=found.K[:, span.stages, :m, :n].contiguous(), d=found.d[:, span.stages, :m].contiguous(),
             multipliers=Multipliers(lam, found.multipliers.mu), violation=violation(form.constraints, X, U),
             times=times, trace=None, search=None,
-            account=Account(member, self.solver, kernels=found.account and found.account.kernels),
+            account=Account(self.problems[i], self.solver, kernels=found.account and found.account.kernels),
         )  # fmt: skip
 
     def __len__(self) -> int:
