@@ -28,8 +28,8 @@ from torchgco.phases.guess import guess
 from torchgco.phases.lowered import Whole
 
 HEAD = (
-    "problem", "phases", "stages", "status", "cost", "off IPOPT's by", "iterations", "IPOPT's", "ms", "in C", "ms of 32",
-    "IPOPT's ms", "ratio", "ratio of 32",
+    "problem", "phases", "stages", "status", "cost", "off IPOPT's by", "iterations", "IPOPT's", "ms", "in C",
+    "ms of 32", "IPOPT's ms", "ratio", "ratio of 32",
 )  # fmt: skip
 MANY = 32  # problems of a batch
 RUNS = 5  # of which the least time counts
@@ -118,7 +118,8 @@ def row(name: str, case: Case) -> list[Any]:
     each, peer, status = every / MANY, theirs.milliseconds, f"{solution.statuses[0].name}, {ended} of {MANY}"
     return [
         name, len(solution), solution.whole.problem.N, status, f"{cost:.8g}", f"{off:.1e}", int(solution.iterations),
-        theirs.iterations, f"{took:.1f}", f"{in_c:.1f}", f"{each:.2f}", f"{peer:.1f}", f"{took / peer:.2f}", f"{each / peer:.2f}",
+        theirs.iterations, f"{took:.1f}", f"{in_c:.1f}", f"{each:.2f}", f"{peer:.1f}", f"{took / peer:.2f}",
+        f"{each / peer:.2f}",
     ]  # fmt: skip
 
 
