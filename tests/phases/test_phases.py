@@ -206,11 +206,25 @@ def test_a_problem_does_not_depend_on_its_batch() -> None:
 
 def test_a_bad_element_ends_by_itself() -> None:
     starts = torch.tensor([[0.0, 0, 0, 0], [0.0, 0, 1, 0]], dtype=D)
-    wild = Jump(lambda x, lost: x / lost.unsqueeze(-1), values={"lost": torch.tensor([1.0, 0.0], dtype=D)})
-    problem = drive(starts, [1.0, 0.0])
-    solution = torchgco.solve(Phases([problem, problem], [wild]))
-    assert solution.statuses == [Status.CONVERGED, Status.NON_FINITE]
-    assert torchgco.judge(Phases([problem, problem], [wild]), solution).feasible.tolist() == [True, False]
+    lost, problem = {"lost": torch.tensor([1.0, 0.0], dtype=D)}, drive(starts, [1.0, 0.0])
+    plain = Jump(lambda x, lost: x / lost.unsqueeze(-1), values=lost)
+    pushed = Jump(lambda x, v, lost: (x + torch.cat((v, v), -1)) / lost.unsqueeze(-1), 2,
+                  lambda x, v: v.square().sum(-1), values=lost)  # fmt: skip
+    for wild in (plain, pushed):
+        solution = torchgco.solve(Phases([problem, problem], [wild]))
+        assert solution.statuses == [Status.CONVERGED, Status.NON_FINITE]
+        assert torchgco.judge(Phases([problem, problem], [wild]), solution).feasible.tolist() == [True, False]
+
+
+def test_rows_of_jumps() -> None:
+    """An impulse that takes the speed along x away, within bounds, whatever it costs."""
+    stop = FunctionConstraint(lambda x, v: x[..., 2:3] + v[..., :1], "equality", of="xu")
+    kick = Jump(lambda x, v: x + torch.cat((0 * v, v), -1), 2, lambda x, v: v.square().sum(-1),
+                constraints=[ControlBounds(-0.1, 0.1), stop])  # fmt: skip
+    problem = drive([[0.0] * 4, [0.1] * 4], [1.0, 0.0])
+    found = solved(Phases([problem, problem], [kick]))
+    torch.testing.assert_close(found.jumps[0][:, 0], -found[0].X[:, -1, 2], rtol=0.0, atol=1e-7)
+    assert float(found.jumps[0].abs().max()) <= 0.1 + 1e-9 and float(found[1].X[:, 0, 2].abs().max()) < 1e-7
 
 
 def test_numbers_that_change_and_warm_starts() -> None:

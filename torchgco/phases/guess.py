@@ -99,6 +99,7 @@ def _controls(jump: Jump, x: Tensor, after: Tensor) -> Tensor:
     v = x.new_zeros(len(x), jump.controls)
     if jump.controls == 0:
         return v
-    (slopes,) = jacobian(lambda v: jump.after(x, v), v)
-    step = torch.linalg.lstsq(slopes, (after - jump.after(x, v)).unsqueeze(-1)).solution.squeeze(-1)
-    return torch.where(torch.isfinite(step).all(-1, keepdim=True), step, v)
+    (slopes,), misfit = jacobian(lambda v: jump.after(x, v), v), (after - jump.after(x, v)).unsqueeze(-1)
+    sound = (torch.isfinite(slopes) & torch.isfinite(misfit)).flatten(1).all(-1).view(-1, 1, 1)
+    pair = (torch.where(sound, z, 0.0) for z in (slopes, misfit))
+    return torch.linalg.lstsq(*pair).solution.squeeze(-1)
