@@ -28,6 +28,7 @@ LAYERS = [
     ["baselines"],
     ["presets"],
     ["fleets", "guesses", "tightened", "warned"],
+    ["phases"],
     ["api", "envs"],
     ["compiled"],
     ["export"],

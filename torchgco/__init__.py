@@ -66,13 +66,14 @@ from torchgco.dynamics import (
 )
 from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
-from torchgco.fleets.judging import judge
 from torchgco.guesses import Guess
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres
+from torchgco.phases import Jump, Phases, PhasesSolution
+from torchgco.phases.judging import judge
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
@@ -101,7 +102,7 @@ __all__ = [  # noqa: RUF022
     # solving it
     "solve", "Guess", "tightened", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "show", "Status", "presets",
-    "Fleet", "FleetSolution", "FleetMPC",
+    "Fleet", "FleetSolution", "FleetMPC", "Phases", "Jump", "PhasesSolution",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result

@@ -164,7 +164,7 @@ def _cost_of(
     costates: Costates | None,
 ) -> Tensor:
     """`StepErrors.step_cost` (B,) of the differences e (B, N, n)."""
-    found = None if costates is None or times is not None else costates(problem, X, U, multipliers)
+    found = None if costates is None else costates(problem, X, U, multipliers)
     whole, X, U = at_times(within_horizons(problem), X, at_rest_after(problem, U), times)
     try:
         found = _costates(whole, X, U, multipliers) if found is None else found
