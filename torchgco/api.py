@@ -385,9 +385,8 @@ def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
     from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
 
     _fleet_of(fleet, solution)
-    arrays = [[tensor.detach().cpu().double().numpy() for tensor in (member.X, member.U)] for member in solution]
-    X, U = zip(*arrays, strict=True)
-    return fleet_figure(fleet.members, X, U, fleet.distances.cpu().double().numpy(), b)
+    members, X, U, distances = solution.arrays()
+    return fleet_figure(members, X, U, distances, b)
 
 
 def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[Solution]]:

@@ -56,7 +56,7 @@ def row(scene: str, V: int, count: int, seed: int) -> list[object]:
     """What a scene comes to."""
     fleet = fleet_of(scene, V, count, seed)
     alone = sum((torchgco.solve(one, verbose=False).cost for one in fleet.members), torch.zeros(count))
-    torchgco.solve(fleet.take([0]))  # compiles
+    torchgco.solve(Fleet(fleet.take([0]).members[:2], float(fleet.distances.max())))  # compiles
     began = time.process_time()
     found = torchgco.solve(fleet)
     spent = (time.process_time() - began) / count
@@ -97,11 +97,14 @@ def text(scenes: list[str], count: int, seed: int) -> str:
     return f"{markdown(HEAD, rows)}\n\n{swapped(count)}"
 
 
-SCENES = ["circle-4", "circle-8", "circle-16", "door-8", "forest-8", "quadrotors-4"]
+SCENES = [
+    *("circle-4", "circle-8", "circle-16", "circle-32"), *("quadrotors-4", "quadrotors-8", "quadrotors-16"),
+    *("forest-8", "forest-16"), *("door-8", "door-16", "door-32"),
+]  # fmt: skip
 main = Command(
     __doc__, "fleets", text, "{count} drawn fleets of each, seed {seed}",
     scenes=(SCENES, "scenes, and vehicles of each"),
-    count=(4, "fleets of each"), seed=(5, "of the layouts"),
+    count=(16, "fleets of each"), seed=(31415, "of the layouts"),
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -19,9 +19,10 @@ from torchgco import (
     RotorTracking,
     Unicycle,
 )
+from torchgco.dynamics import PointMass
 from torchgco.lagrangian.expansion import linearise
 
-MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle, Bicycle]
+MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle, Bicycle, PointMass]
 FIELDS = {
     Planar: reference.planar_field,
     QuadrotorPlanning: reference.quadrotor_planning_field,
@@ -29,6 +30,7 @@ FIELDS = {
     RotorTracking: reference.rotor_field,
     Unicycle: reference.unicycle_field,
     Bicycle: reference.bicycle_field,
+    PointMass: lambda x, u: np.concatenate((x[2:], u)),
 }
 
 

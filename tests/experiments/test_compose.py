@@ -34,9 +34,10 @@ SHARED = (
     "traffic",
     "walkers",
 )  # positions alone: any model
+FLEETS = ("fleet_circle", "fleet_door", "fleet_forest")  # as well
 OF_MODEL = {
     "planar": ("planar_random", "planar_trap", "planar_trap_paper"), "unicycle": (*SHARED, "yard"),
-    "car": ("parking",),
+    "car": ("parking",), "disc": FLEETS,
     "quadrotor": (
         "crossing", "cylinders", "forest", "forest_mission", "forest_moving", "gates", "mazes", "rooms", "swarm",
         "trefoils", "walls", "woods",
@@ -51,7 +52,11 @@ def checked(*words: str) -> Setup:
     """All that a study checks before it flies."""
     setup = compose(words)
     plan_of(setup)
-    task = setup.task(setup.layouts(1))
+    layouts = setup.layouts(1)
+    if layouts.vehicles is not None:
+        assert layouts.vehicles == setup.fleet(layouts).V
+        return setup
+    task = setup.task(layouts)
     if setup.mission is not None:
         check_mission(setup.mission, task)
     return setup
@@ -117,7 +122,10 @@ def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment:
 
 @pytest.mark.parametrize("scenario", mostly(MODEL, *set(MODEL) - set(tuple(MODEL)[::3])))
 def test_a_model_that_cannot_fly_a_scenario_is_refused_with_one_that_can(scenario: str) -> None:
-    fitting = ("planar", "unicycle", "car") if scenario in SHARED else (MODEL[scenario],)  # each rests there
+    fitting = (
+        ("planar", "unicycle", "car", "disc") if scenario in (*SHARED, *FLEETS) else (MODEL[scenario],)
+    )  # each rests there
+    fitting = ("unicycle", "disc") if scenario == "yard" else fitting  # which have as many states
     wanted = " or ".join(f"model={model}" for model in fitting)
     for other in options_of("model"):
         if other not in fitting:

@@ -56,3 +56,7 @@ def test_plans_that_touch_one_in_force_are_not_adopted() -> None:
     assert bool(mpc.adopted[0, 0]) and torch.equal(mpc.plans[0].X, X) and torch.equal(p[0, 0], X[0, :, :2])
     with pytest.raises(InputError, match=r"x: expected states \(B, n\) of each of 3 vehicles"):
         mpc.step(torch.zeros(3, 4))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"x\[1\]: expected shape \(1, 4\), got \(1, 3\)"):
+        mpc.step([torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1, 4)])
+    with pytest.raises(InputError, match=r"fleet: expected a Fleet, got list"):
+        FleetMPC(list(fleet.members))  # type: ignore[arg-type]

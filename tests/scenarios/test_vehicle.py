@@ -16,8 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def vehicle(name: str):
-    scenario = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard", "car": "parking"}.get(name, "planar_trap")
-    return compose([f"model={name}", f"scenario={scenario}"]).vehicle
+    own = {"quadrotor": "forest", "rotors": "race", "unicycle": "yard", "car": "parking", "disc": "fleet_door"}
+    return compose([f"model={name}", f"scenario={own.get(name, 'planar_trap')}"]).vehicle
 
 
 def test_public_layouts_make_the_published_problem() -> None:
@@ -60,19 +60,24 @@ def test_a_mismatch_names_the_model_to_give(name: str, other: str) -> None:
 def test_the_built_in_models_are_those_of_the_configurations() -> None:
     assert set(BUILT_IN) == {path.stem for path in (ROOT / "conf" / "model").glob("*.yaml")}
     for name, form in BUILT_IN.items():
-        assert form == (vehicle(name).dimension, vehicle(name).dynamics.n) and fitting(*form) == f"model={name}"
-    assert fitting(2, None) == "model=planar or model=unicycle or model=car" == fitting(2, 7)
+        assert form == (vehicle(name).dimension, vehicle(name).dynamics.n)
+        alike = [f"model={other}" for other, space in BUILT_IN.items() if space == form]
+        assert fitting(*form) == " or ".join(alike) and (len(alike) == 1 or form == (2, 4))
+    assert fitting(2, None) == "model=planar or model=unicycle or model=car or model=disc" == fitting(2, 7)
 
 
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ("model=planar scenario=yard", "expected model=unicycle, as yard is 2-D with 4 states, got model=planar"),
+        (
+            "model=planar scenario=yard",
+            "expected model=unicycle or model=disc, as yard is 2-D with 4 states, got model=planar",
+        ),
         ("model=unicycle scenario=planar_trap", "model=planar, as planar_trap is 2-D with 6 states, got model=un"),
         (
             "model=quadrotor scenario=yard",
-            "expected model=unicycle, as yard is 2-D with 4 states, or scenario=crossing or cylinders or forest or "
-            "forest_moving or gates or mazes or rooms or swarm or trefoils or walls or woods, got model=quadrotor",
+            "expected model=unicycle or model=disc, as yard is 2-D with 4 states, or scenario=crossing or cylinders or "
+            "forest or forest_moving or gates or mazes or rooms or swarm or trefoils or walls or woods, got model=quad",
         ),
         ("model=unicycle scenario=forest", "expected model=quadrotor, as forest is 3-D with 14 states"),
     ],
@@ -91,7 +96,7 @@ def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
         assert setup.task().problem.n == BUILT_IN[name][1]
     with pytest.raises(
         InputError,
-        match="expected model=planar or model=unicycle or model=car, as bare is 2-D, or scenario=crossing or",
+        match="expected model=planar or model=unicycle or model=car or model=disc, as bare is 2-D, or scenario=",
     ):
         compose([*words, "model=quadrotor"])
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchgco.api import solve
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import PositiveOrInfinite, check_value
+from torchgco.base.shapes import check_shape
 from torchgco.compiled.mpc import MPC
 from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.fleets.among import Among
@@ -55,6 +56,8 @@ class FleetMPC:
     def __init__(
         self, fleet: Fleet, solver: str | None = None, period: float | None = None, *, max_seconds: float | None = None
     ) -> None:
+        if not isinstance(fleet, Fleet):
+            raise InputError("fleet", "a Fleet", type(fleet).__name__)
         limit = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
         self.fleet, self.t = fleet, 0.0
         self.first: FleetSolution = solve(fleet, max_seconds=None if limit == torch.inf else limit)
@@ -81,6 +84,8 @@ class FleetMPC:
         if isinstance(x, Tensor) or len(x) != self.fleet.V:
             raise InputError("x", f"states (B, n) of each of {self.fleet.V} vehicles", shown(x))
         states = [torch.as_tensor(part, dtype=torch.float64) for part in x]
+        for v, (one, state) in enumerate(zip(self.fleet.members, states, strict=True)):
+            check_shape(state, (self.fleet.B, one.n), f"x[{v}]")
         p, B = self._places(), self.fleet.B
         self.adopted = torch.zeros_like(self.adopted)
         for loop, name, whose in self._loops:

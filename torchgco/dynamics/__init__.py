@@ -8,6 +8,7 @@ from torchgco.dynamics.base import Dynamics as Dynamics
 from torchgco.dynamics.base import FunctionDynamics as FunctionDynamics
 from torchgco.dynamics.bicycle import Bicycle as Bicycle
 from torchgco.dynamics.planar import Planar as Planar
+from torchgco.dynamics.point_mass import PointMass as PointMass
 from torchgco.dynamics.quadrotor import Airframe as Airframe
 from torchgco.dynamics.quadrotor import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics.quadrotor import QuadrotorPlant as QuadrotorPlant

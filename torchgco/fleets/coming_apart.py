@@ -23,7 +23,7 @@ from torchgco.fleets.plans import Plans
 from torchgco.problem.known import Known
 
 ROUNDS = 24  # at most
-PATIENCE, LEFT = 5, 0.7  # rounds, after which no more than this share of what was lacking may be left
+PATIENCE, LEFT = 7, 0.9  # rounds, after which no more than this share of what was lacking may be left
 WIDEST = 0.25  # as a share of what they keep, how far vehicles move in the first round at most
 WIDER, NARROWER = 2.0, 0.3  # times as far after a round that brings them farther apart, and after another one
 CLOSE, NEARLY = 0.02, 0.25  # shares of what a pair keeps: with so little lacking there is no other round, and planes do

@@ -97,7 +97,7 @@ class Fleet:
 
     def take(self, b: Sequence[int]) -> Fleet:
         """The fleets at some places of the batch."""
-        rows, one = torch.tensor(list(b)), object.__new__(Fleet)
+        rows, one = torch.tensor(list(b), dtype=torch.int64), object.__new__(Fleet)
         members = tuple(each.take(rows) for each in self.members)
         at = [torch.cat([place * self.B + rows for place in range(len(whose))]) for _, whose in self.forms]
         forms = tuple((batch.take(own), whose) for (batch, whose), own in zip(self.forms, at, strict=True))

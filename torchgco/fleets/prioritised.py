@@ -17,12 +17,13 @@ from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, bent, in_conflict, late, widths
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
-from torchgco.judging.judge import judge
+from torchgco.kernels import path_clearance
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import library_for
 from torchgco.search.timed import ways_in_time
 from torchgco.search.timed_guesses import guesses_along
 from torchgco.search.timed_scenes import can_search
+from torchgco.solution import Solution
 
 RESTARTS = 3  # of each team
 DELAYS = 0.1, 0.2, 0.4  # of beginning, shares of all stages
@@ -38,9 +39,10 @@ class Prioritised:
         fleet: of which these are.
         forms: of its vehicles.
         of: which of the fleets each team is, (C,).
-        alone: what its vehicles do without the others.
+        alone: what its vehicles do without the others; with `again` what they do now.
         orders: in which its vehicles plan, of each team.
         late: whether the time is over.
+        again: the vehicles in `orders` plan again, among the motions of all others; there are no restarts.
     """
 
     def __init__(
@@ -51,20 +53,24 @@ class Prioritised:
         alone: Plans,
         orders: Sequence[Sequence[int]],
         late: Callable[[], bool] = lambda: False,
+        again: bool = False,
     ) -> None:
         C, V = len(of), fleet.V
         self.fleet, self.forms, self.of, self.alone, self.late = fleet, forms, of, alone, late
         self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
         self.order = [list(order) for order in orders]
-        self.at, self.restarts = [0] * C, [0] * C
+        self.at, self.restarts = [0] * C, [RESTARTS if again else 0] * C
         self.plans = alone.take(torch.arange(C))
-        self.known = torch.zeros(C, V, dtype=torch.bool)
+        self.known = torch.full((C, V), again)
         self.off = alone.X[0].new_zeros(C, V)  # by which paths leave the chords that others know, m
+        if again:
+            each = zip(fleet.members, alone.X, alone.U, strict=True)
+            self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
         self.wide = widths(fleet, in_conflict(fleet, alone))
 
     def run(self) -> Plans:
         """Plans of all teams; vehicles without one are where they would be alone."""
-        while rows := [c for c in range(len(self.of)) if self.at[c] < self.fleet.V]:
+        while rows := [c for c in range(len(self.of)) if self.at[c] < len(self.order[c])]:
             if self.late():
                 break
             turn = {c: self.order[c][self.at[c]] for c in rows}
@@ -145,12 +151,12 @@ class _Turn:
         for _ in range(1 + REPAIRS):
             own = whose[left]
             solution = SOLVER.solve(self._problem(own, grown[left]), U0[left], X0=X0[left])
-            fine, cost, touch = arrives(self._problem(own), solution.U)
+            fine, touch = arrives(self._problem(own), solution)
             for place, i in enumerate(own.tolist()):
                 c, v = int(self.teams[i]), int(self.vehicles[i])
                 self.run.plans.iterations[c, v] += solution.iterations[place]
-                if fine[place] and cost[place] < self.cost[i]:
-                    self.cost[i] = cost[place]
+                if fine[place] and solution.cost[place] < self.cost[i]:
+                    self.cost[i] = solution.cost[place]
                     self.run.plans.set(v, torch.tensor([c]), solution, torch.tensor([place]))
             again = ~fine & (touch < 0) & (solution.violation <= ADMITTED)
             X0[left], U0[left] = solution.X, solution.U
@@ -160,7 +166,12 @@ class _Turn:
                 break
 
 
-def arrives(problem: Problem, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Whether controls are sound, (b,) each; their costs; and by how much they keep from contact, m."""
-    verdict = judge(problem, U)
-    return verdict.reached if states_goal(problem) else verdict.feasible, verdict.cost, verdict.clearance
+def arrives(problem: Problem, found: Solution) -> tuple[Tensor, Tensor]:
+    """Whether solutions are sound, and by how much they keep from contact, m, (b,) each: as solvers see it, as what
+    becomes of the fleet is judged."""
+    clear = path_clearance(problem, found.X, found.U)
+    fine, goal = (found.violation <= ADMITTED) & (clear >= 0), problem.goal
+    if goal is not None and states_goal(problem):
+        away = (found.X[:, -1, problem.position] - goal.position).norm(dim=-1)
+        fine &= away < goal.radius + (ADMITTED if goal.required else 0.0)
+    return fine, clear

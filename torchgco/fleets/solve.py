@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base import clock
+from torchgco.base.status import Status
 from torchgco.base.tree import put, take
 from torchgco.fleets.among import Among
 from torchgco.fleets.coming_apart import ComingApart
@@ -33,11 +34,18 @@ class _Best:
     def __init__(self, fleet: Fleet, plans: Plans) -> None:
         self.fleet, self.plans = fleet, plans
         self.verdict = judge_fleet(fleet, plans.U)
+        self.least = self.costs  # (B, V), of vehicles alone
+        self.lost = torch.isin(plans.status, torch.tensor([Status.INVALID_START, Status.NON_FINITE])).any(-1)
+
+    @property
+    def costs(self) -> Tensor:
+        """Of all vehicles, (B, V)."""
+        return torch.stack([one.cost for one in self.verdict.vehicles], dim=1)
 
     @property
     def open(self) -> Tensor:
-        """Fleets that aren't sound yet, (b,)."""
-        return (~self.verdict.reached).nonzero().flatten()
+        """Fleets that aren't sound yet, and can be: all of their vehicles have a start and a plan, (b,)."""
+        return (~self.verdict.reached & ~self.lost).nonzero().flatten()
 
     def offer(self, rows: Tensor, plans: Plans) -> None:
         """Keep plans of some fleets where they are better: sound, else closer to that, else cheaper."""
@@ -92,13 +100,43 @@ def solve_fleet(
                 best.offer(rows, teams.take(torch.arange(i, len(of), ORDERS)))
             rows = rows[best.verdict.reached[rows]]
             _improve(best, forms, rows, best.plans.take(rows), late)
+        _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
-    """Offer what sharing the room makes of plans for some fleets, (b,)."""
-    if len(rows) > 0 and not late():
-        best.offer(rows, SharedRoom(best.fleet, forms, rows, plans, late).run())
+    """Offer what sharing the room makes of plans for some fleets, (b,).
+
+    Where some vehicles are left a little too close, each of them plans again among all others.
+    """
+    for again in (True, False):
+        if len(rows) == 0 or late():
+            return
+        plans = SharedRoom(best.fleet, forms, rows, plans, late).run()
+        best.offer(rows, plans)
+        left = (~best.verdict.reached[rows]).nonzero().flatten()
+        if len(left) == 0 or not again:
+            return
+        rows, plans = rows[left], plans.take(left)
+        apart = judge_fleet(best.fleet.take(rows.tolist()), plans.U).apart
+        orders = [(~one).nonzero().flatten().tolist() for one in apart]
+        for turned in (False, True):
+            some = [order[::-1] if turned else order for order in orders]
+            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, again=True).run())
+        rows = rows[best.verdict.reached[rows]]
+        plans = best.plans.take(rows)
+
+
+def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
+    """Where one vehicle pays more for the others than all of these together, it plans again among them."""
+    paid = best.costs - best.least
+    rows = (best.verdict.reached & (2.0 * paid.amax(-1) > paid.sum(-1))).nonzero().flatten()
+    if len(rows) == 0 or late():
+        return
+    before, orders = best.verdict.cost[rows], [[v] for v in paid[rows].argmax(-1).tolist()]
+    best.offer(rows, Prioritised(best.fleet, forms, rows, best.plans.take(rows), orders, late, again=True).run())
+    rows = rows[best.verdict.cost[rows] < before]
+    _improve(best, forms, rows, best.plans.take(rows), late)
 
 
 def _orders(fleet: Fleet, seed: int, number: int) -> list[list[int]]:

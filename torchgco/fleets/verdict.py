@@ -53,7 +53,7 @@ def judge_fleet(fleet: Fleet, U: Sequence[Tensor]) -> FleetVerdict:
     keep, p = fleet.distances[i, j], fleet.places(X)
     at_knots = (p[:, i] - p[:, j]).norm(dim=-1).amin(-1)
     least = torch.minimum(at_knots, _least(fleet, X, U))
-    touches = (keep - at_knots > ADMITTED) | (least < CONTACT_FACTOR * keep)
+    touches = ~((keep - at_knots <= ADMITTED) & (least >= CONTACT_FACTOR * keep))  # places that aren't finite do
     close = touches.long().new_zeros(fleet.B, fleet.V).index_add(1, i, touches.long()).index_add(1, j, touches.long())
     short, touch = (keep - at_knots).amax(-1).clamp(min=0.0), (least - CONTACT_FACTOR * keep).amin(-1)
     violation = torch.stack([v.violation for v in verdicts]).amax(0).maximum(short)
@@ -80,7 +80,7 @@ def makespan(fleet: Fleet, X: Sequence[Tensor]) -> Tensor:
             return torch.full_like(last, torch.nan)
         assert one.goal is not None
         away = (x[..., one.position] - one.goal.position.unsqueeze(1)).norm(dim=-1)
-        out = away > one.goal.radius.view(-1, 1)
+        out = ~(away <= one.goal.radius.view(-1, 1))
         k = torch.arange(x.shape[1], device=x.device)
         stays = torch.where(out, k + 1, 0).amax(-1).to(last.dtype)
         last = torch.maximum(last, torch.where(out[:, -1], torch.nan, stays))

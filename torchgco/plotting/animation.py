@@ -41,8 +41,6 @@ def mission_animation(
     """
     t, track = flight(frame, "t")["t"], course.track(frame)
     check_plans(plans, len(t))
-    every = max(1, round(1.0 / (FPS * period)), ceil((len(t) - 1) / (MAX_FRAMES - 2)))
-    steps = sorted({*range(0, len(t), every), len(t) - 1})
     low, high = course.limits(track)
     spans = (high - low)[1:] / (high - low)[0]
     figure = Figure(figsize=(7.0, 6.2 * float(spans.sum()) + 1.1), layout="constrained")
@@ -61,15 +59,27 @@ def mission_animation(
             draw_instant(ax, course, t[step], track[: step + 1], plans[step], period, plane)
         return f"{title}  {t[step]:.1f} s".strip()
 
-    last = steps[-1:] * min(FPS, MAX_FRAMES - len(steps))  # the end stays for a second
-    return write_gif(axes, show, [*steps, *last], path)
+    return write_gif(axes, show, frames_of(len(t), period), path)
 
 
-def write_gif(axes: Sequence[Axes], show: Callable[[int], str], frames: Sequence[int], path: Path) -> Path:
+def frames_of(count: int, period: float) -> list[int]:
+    """Which of `count` instants, each a period after the one before, s, are pictures; the end stays for a second."""
+    every = max(1, round(1.0 / (FPS * period)), ceil((count - 1) / (MAX_FRAMES - 2)))
+    steps = sorted({*range(0, count, every), count - 1})
+    return [*steps, *steps[-1:] * min(FPS, MAX_FRAMES - len(steps))]
+
+
+def write_gif(
+    axes: Sequence[Axes],
+    show: Callable[[int], str],
+    frames: Sequence[int],
+    path: Path,
+    colours: Sequence[str] = PALETTE,
+) -> Path:
     """Write a GIF of `show(i)` for i in frames, which adds what changes to axes and returns the title of the first.
 
     What the axes hold before is drawn once; equal neighbours are drawn once. All pictures have one palette without
-    dithering: neighbours then differ only where something moved.
+    dithering: neighbours then differ only where something moved. `colours` are among its colours.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,7 +93,7 @@ def write_gif(axes: Sequence[Axes], show: Callable[[int], str], frames: Sequence
     canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
     palette = Image.new("P", (1, 1))
-    palette.putpalette(_palette())
+    palette.putpalette(_palette(colours))
     pictures = list[Image.Image]()
     for i, before in zip(frames, [None, *frames], strict=False):
         if i == before:
@@ -104,11 +114,11 @@ def write_gif(axes: Sequence[Axes], show: Callable[[int], str], frames: Sequence
     return path
 
 
-def _palette() -> list[int]:
+def _palette(more: Sequence[str]) -> list[int]:
     """The colours of the drawings, full and paler, as bytes of red, green and blue; the rest is white."""
     times = [draw.NEAR_TO_FAR(share)[:3] for share in np.linspace(0.0, 1.0, 16)]
     full = np.array(
-        [to_rgb(colour) for colour in (INK, VEHICLE_COLOUR, draw.CROSS, draw.EDGE, draw.STONE, UNSEEN, PALE, *PALETTE)]
+        [to_rgb(colour) for colour in (INK, VEHICLE_COLOUR, draw.CROSS, draw.EDGE, draw.STONE, UNSEEN, PALE, *more)]
     )
     full = np.concatenate((full, times))
     shades = [1.0 - share * (1.0 - full) for share in (1.0, 0.6, 0.3)]

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from torchgco.base.errors import InputError
+from torchgco.plotting.animation import PALE, frames_of, write_gif
 from torchgco.plotting.bodies import ABOVE, SIDE
 from torchgco.plotting.problems import TALLEST_SCENE, WIDTH, Course, SceneMap
 from torchgco.plotting.style import INK, PALETTE, SMALL, NotebookFigure, tidy
@@ -33,27 +38,63 @@ def fleet_figure(
     b = 0 if b is None else b
     if not isinstance(b, int) or isinstance(b, bool) or not 0 <= b < members[0].B:
         raise InputError("b", f"the place of a fleet, 0 to {members[0].B - 1}", b)
-    t = float(members[0].dynamics.dt) * np.arange(members[0].N + 1)
-    courses = []
-    for v, (member, x, u) in enumerate(zip(members, X, U, strict=True)):
-        path = x[b][:, member.position]
-        courses.append(Course(b, x[b], u[b], t, (path,), _colour(v, len(members)), f"vehicle {v}", True, True))
-    planes = (ABOVE, SIDE) if courses[0].paths[0].shape[1] == 3 else (ABOVE,)
-    drawn = SceneMap.of(members[0], courses, planes)
-    high = drawn.height(WIDTH)
+    drawn = _scene(members, X, U, b)
+    courses, planes, high = drawn.courses, drawn.planes, drawn.height(WIDTH)
     figure = NotebookFigure(figsize=(WIDTH, min(high, TALLEST_SCENE * len(planes)) + LOWER), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, LOWER))[:, 0]
     drawn.draw(upper)
-    for ax, plane in zip(upper.axes, planes, strict=True):
+    _ends(upper.axes, members, drawn)
+    _distances(lower.subplots(), courses[0].t, [course.paths[0] for course in courses], distances)
+    return figure
+
+
+def fleet_animation(
+    members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.ndarray], distances: np.ndarray, path: Path
+) -> Path:
+    """Write a GIF of the first fleet, 5 pictures per second, in real time where 100 suffice: discs half as wide as what
+    the vehicles keep, with their ways so far, and where all of these lead."""
+    drawn = _scene(members, X, U, 0)
+    t, colours = drawn.courses[0].t, [course.colour for course in drawn.courses]
+    paths, radii = [course.paths[0] for course in drawn.courses], 0.5 * distances.max(axis=1)
+    pale = replace(drawn, courses=[replace(course, colour=PALE) for course in drawn.courses])
+    figure = Figure(figsize=(WIDTH, drawn.height(WIDTH) + 0.4), layout="constrained")
+    pale.draw(figure)
+    _ends(figure.axes, members, drawn)
+
+    def show(k: int) -> str:
+        for ax, plane in zip(figure.axes, drawn.planes, strict=True):
+            for way, radius, colour in zip(paths, radii, colours, strict=True):
+                ax.plot(*way[: k + 1, plane].T, color=colour, linewidth=1.2, zorder=7)
+                x, y = way[k, list(plane)].tolist()
+                ax.add_patch(Circle((x, y), radius, facecolor=colour, edgecolor="white", zorder=8))
+        return f"{t[k]:.1f} s"
+
+    return write_gif(figure.axes, show, frames_of(len(t), float(t[1])), path, colours)
+
+
+def _scene(members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.ndarray], b: int) -> SceneMap:
+    """The obstacles of the first vehicle, and all ways."""
+    t = float(members[0].dynamics.dt) * np.arange(members[0].N + 1)
+    courses = []
+    for v, (member, x, u) in enumerate(zip(members, X, U, strict=True)):
+        way = x[b][:, member.position]
+        courses.append(Course(b, x[b], u[b], t, (way,), _colour(v, len(members)), f"vehicle {v}", True, True))
+    planes = (ABOVE, SIDE) if courses[0].paths[0].shape[1] == 3 else (ABOVE,)
+    return SceneMap.of(members[0], courses, planes)
+
+
+def _ends(axes: Sequence[Axes], members: Sequence[Problem], drawn: SceneMap) -> None:
+    """Starts as squares and goals as stars, in the colours of the vehicles."""
+    for ax, plane in zip(axes, drawn.planes, strict=True):
         ax.set_title("")
-        for member, course in zip(members, courses, strict=True):
+        for member, course in zip(members, drawn.courses, strict=True):
             look: dict[str, Any] = {"linestyle": "none", "markeredgecolor": course.colour, "zorder": 6}
             ax.plot(*course.paths[0][:1, plane].T, marker="s", markersize=5, markerfacecolor="white", **look)
             if member.goal is not None:
-                ends = member.goal.position[b].cpu().numpy()[list(plane)]
+                ends = member.goal.position[course.b].cpu().numpy()[list(plane)]
                 ax.plot(*ends, marker="*", markersize=8, markerfacecolor=course.colour, **look)
-    _distances(lower.subplots(), t, [course.paths[0] for course in courses], distances)
-    return figure
+                near: dict[str, Any] = {"fill": False, "edgecolor": course.colour, "linestyle": "--", "linewidth": 0.8}
+                ax.add_patch(Circle((ends[0], ends[1]), float(member.goal.radius[course.b]), **near))
 
 
 def _colour(v: int, count: int) -> str:

@@ -195,7 +195,7 @@ class SceneMap:
         tallest = TALLEST_SCENE if all(scene.map is None for scene in self.world.scenes) else TALLEST_MAP
         return min(tallest, wide * sum(self.shares)) + 0.45 * len(self.planes)
 
-    def draw(self, figure: SubFigure) -> set[str]:
+    def draw(self, figure: Figure | SubFigure) -> set[str]:
         """Draw each plane into axes of its own; returns the kinds of what is drawn, for the legend."""
         ratios = {"height_ratios": self.shares}
         axes = figure.subplots(len(self.planes), 1, squeeze=False, gridspec_kw=ratios)[:, 0]

@@ -8,6 +8,9 @@ from torchgco.scenarios.base import Scenario as Scenario
 from torchgco.scenarios.crossing import Crossing as Crossing
 from torchgco.scenarios.cylinders import Cylinders as Cylinders
 from torchgco.scenarios.files import LayoutFile as LayoutFile
+from torchgco.scenarios.fleets import FleetCircle as FleetCircle
+from torchgco.scenarios.fleets import FleetDoor as FleetDoor
+from torchgco.scenarios.fleets import FleetForest as FleetForest
 from torchgco.scenarios.floors import Floors as Floors
 from torchgco.scenarios.gates import GateForest as GateForest
 from torchgco.scenarios.gates import Race as Race
@@ -38,4 +41,5 @@ from torchgco.scenarios.yard import Yard as Yard
 FAMILIES: tuple[type[Scenario], ...] = (
     Forest, ForestMoving, Walls, Woods, Mazes, Crossing, Cylinders, Rooms, Trefoils, PlanarTrap, PlanarRandom, Yard,
     Floors, GateForest, Race, Parking, Traffic, Sliding, Walkers, Revolving, Conveyor, Swarm,
+    FleetCircle, FleetDoor, FleetForest,
 )  # fmt: skip

@@ -26,6 +26,7 @@ class Scenario(ABC):
 
     name: str
 
+    model: ClassVar[str | None] = None  # of those whose layouts any model flies, which one does by default; None: any
     shares_map = True  # whether all layouts have one map, where they have any
 
     @property

@@ -44,7 +44,9 @@ Point3 = tuple[Coordinate, Coordinate, Coordinate]
 Region2 = tuple[Range, Range]
 Region3 = tuple[Range, Range, Range]
 # Numbers that layouts share, by field.
-SCALARS: dict[str, Any] = {"vehicle_radius": Length, "goal_radius": Size, "dt": TimeStep, "stages": Stages}
+SCALARS: dict[str, Any] = {
+    "vehicle_radius": Length, "goal_radius": Size, "dt": TimeStep, "stages": Stages, "apart": Size,
+}  # fmt: skip
 
 
 def stages_for(way: float, pace: float, dt: float) -> int:
@@ -193,18 +195,20 @@ def _turns(value: Any, centers: np.ndarray) -> np.ndarray:
     return _present(turns, good, centers, field, expected)
 
 
-def states(value: Any, field: str, centers: np.ndarray) -> np.ndarray | None:
-    """Finite states (L, n), n >= d, from one state (n,) for all layouts or one each (L, n)."""
+def states(value: Any, field: str, centers: np.ndarray, fleets: bool = False) -> np.ndarray | None:
+    """Finite states (L, n), n >= d, from one state (n,) for all layouts or one each (L, n); of fleets (L, V, n)."""
     if value is None:
         return None
     rows = array(value, field)
     count, _, dimension = centers.shape
-    fits = rows.ndim == 1 or (rows.ndim == 2 and rows.shape[0] == count)
-    if not fits or rows.shape[-1] < dimension:
-        expected = f"shape (n,) or ({count}, n) with n >= {dimension}"
-        raise InputError(field, expected, f"shape {rows.shape}")
-    rows = np.tile(rows, (count, 1)) if rows.ndim == 1 else rows
-    _none_of(~np.isfinite(rows).all(axis=1), field, "finite states", rows)
+    axes = 2 + fleets
+    fits = rows.ndim == axes - 1 or (rows.ndim == axes and rows.shape[0] == count)
+    if not fits or rows.shape[-1] < dimension or (fleets and rows.shape[-2] < 2):
+        of_each = "V, n" if fleets else "n"
+        expected = f"shape ({of_each if fleets else 'n,'}) or ({count}, {of_each}) with n >= {dimension}"
+        raise InputError(field, expected + (" and V >= 2" if fleets else ""), f"shape {rows.shape}")
+    rows = np.tile(rows, (count, *[1] * (axes - 1))) if rows.ndim < axes else rows
+    _none_of(~np.isfinite(rows).all(axis=-1), field, "finite states", rows)
     _bounded(rows, field)
     return rows
 

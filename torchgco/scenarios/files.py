@@ -41,7 +41,7 @@ class LayoutFile(Scenario):
     def states(self) -> int | None:
         """Number n of states in the file's start and goal; None where it has neither, or positions alone."""
         ends = (self.layouts.start, self.layouts.goal)
-        return next((s.shape[1] for s in ends if s is not None and s.shape[1] != self.dimension), None)
+        return next((s.shape[-1] for s in ends if s is not None and s.shape[-1] != self.dimension), None)
 
     @property
     def available(self) -> int:

@@ -47,8 +47,9 @@ class Layouts:
         radii: (L, M) m, NaN where absent.
         velocities: (L, M, d) m/s, constant, or None if nothing moves.
         start, goal: (L, n) states, given as (n,) or (L, n), positions first; or positions alone, (d,) or (L, d), where
-            the vehicle rests; or None.
+            the vehicle rests; or None. Of fleets with an axis of V vehicles before the last, (V, n) or (L, V, n).
         vehicle_radius, goal_radius, dt: m, m, s; each one number for all layouts, or None.
+        apart: what the centres of any two vehicles keep from each other, m: the layouts are of fleets; or None.
         stages: N, one number for all layouts, or (L,) where they differ, or None.
         control_lower, control_upper: (m,) in the units of the inputs, infinite or None where unbounded; or None.
         best_cost: (L,) J_var of the best solution known, NaN where none is, or None.
@@ -82,6 +83,7 @@ class Layouts:
     vehicle_radius: float | None = None
     goal_radius: float | None = None
     dt: float | None = None
+    apart: float | None = None
     stages: int | np.ndarray | None = None
     control_lower: np.ndarray | None = None
     control_upper: np.ndarray | None = None
@@ -110,7 +112,10 @@ class Layouts:
         checked |= zip(SINES, checks.sines([getattr(self, name) for name in SINES], boxes[0]), strict=True)
         checked |= zip(GATES, checks.gates(self.gate_centers, self.gate_radii, centers), strict=True)
         checked |= {TIME: checks.free_time(self.free_time, moving), BINDS: checks.required(self.goal_required)}
-        checked |= {name: checks.states(getattr(self, name), f"layouts.{name}", centers) for name in ("start", "goal")}
+        checked |= {
+            name: checks.states(getattr(self, name), f"layouts.{name}", centers, self.apart is not None)
+            for name in ("start", "goal")
+        }
         checked |= {name: checks.scalar(name, getattr(self, name)) for name in SHARED}
         checked |= zip(CONTROLS, checks.control_bounds(self.control_lower, self.control_upper), strict=True)
         checked |= {"stages": checks.stages(self.stages, len(centers)), "ids": checks.ids(self.ids, len(centers))}
@@ -118,10 +123,30 @@ class Layouts:
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         object.__setattr__(self, "map", self._checked_map())
-        lengths = {state.shape[1] for state in (self.start, self.goal) if state is not None} - {centers.shape[2]}
-        if self.start is not None and self.goal is not None and len(lengths) > 1:
-            raise InputError("layouts.goal", f"n = {self.start.shape[1]} as start has", self.goal.shape[1])
+        self._check_ends()
         check_value(self.name, str, "layouts.name")
+
+    def _check_ends(self) -> None:
+        """Raise where start and goal are of other vehicles, or of other fleets."""
+        start, goal = self.start, self.goal
+        if start is None or goal is None:
+            if self.apart is not None:
+                raise InputError("layouts.start", "start and goal of each vehicle, as apart is given", "none")
+            return
+        if len({start.shape[-1], goal.shape[-1]} - {self.dimension}) > 1:
+            raise InputError("layouts.goal", f"n = {start.shape[-1]} as start has", goal.shape[-1])
+        if start.shape[:-1] != goal.shape[:-1]:
+            raise InputError("layouts.goal", f"{start.shape[1]} vehicles as start has", goal.shape[1])
+
+    @property
+    def vehicles(self) -> int | None:
+        """V, of fleets; else None."""
+        return None if self.apart is None or self.start is None else self.start.shape[1]
+
+    def of_vehicle(self, v: int) -> Layouts:
+        """The layouts of fleets as one of their vehicles has them, without the others."""
+        assert self.start is not None and self.goal is not None
+        return replace(self, start=self.start[:, v], goal=self.goal[:, v], apart=None)
 
     def _checked_map(self) -> DistanceField | None:
         field, count = self.map, len(self.centers)
@@ -146,7 +171,7 @@ class Layouts:
         """The places of layouts that a batch of problems can hold, at most so many: those with as many gates."""
         counts = np.zeros(self.count, np.int64) if self.gate_counts is None else self.gate_counts
         kinds = [np.flatnonzero(counts == count) for count in np.unique(counts)]
-        if self.free_time is not None:
+        if self.free_time is not None or self.vehicles is not None:
             kinds = self.alike()
         size = most or self.count
         return [group[first : first + size] for group in kinds for first in range(0, len(group), size)]
@@ -254,7 +279,7 @@ def concatenate(parts: Sequence[Layouts]) -> Layouts:
     _same("dimension", [part.dimension for part in parts])
     shared = {name: _same(name, [getattr(part, name) for part in parts]) for name in (*SHARED, *CONTROLS, TIME, BINDS)}
     for name in ("start", "goal"):
-        _same(name, [None if (states := getattr(part, name)) is None else states.shape[1] for part in parts])
+        _same(name, [None if (states := getattr(part, name)) is None else states.shape[1:] for part in parts])
     return Layouts(
         **_joined(parts, SPHERES),
         **_joined(parts, (*BOXES, *SINES)),

@@ -36,7 +36,9 @@ STATE_ARRAYS = ("state_weight", "terminal_weight", "start", "goal")  # fields wi
 CONTROL_LIMITS = ("control_lower", "control_upper")
 CONTROL_ARRAYS = ("control_weight", "control_reference", *CONTROL_LIMITS)
 # The models of conf/model: dimension of space and number of states.
-BUILT_IN = {"planar": (2, 6), "unicycle": (2, 4), "car": (2, 5), "quadrotor": (3, 14), "rotors": (3, 13)}
+BUILT_IN = {
+    "planar": (2, 6), "unicycle": (2, 4), "car": (2, 5), "disc": (2, 4), "quadrotor": (3, 14), "rotors": (3, 13),
+}  # fmt: skip
 # Share of the control weights that is left, per second, where time is the cost: without any, controls that time doesn't
 # ask for would be anything.
 BESIDE_TIME = 1e-4
@@ -210,10 +212,14 @@ class Vehicle:
             raise InputError("layouts", "Layouts", type(layouts).__name__)
         if dtype not in (torch.float64, torch.float32):
             raise InputError("dtype", "torch.float64 or torch.float32", repr(dtype))
+        if layouts.vehicles is not None:
+            raise InputError(
+                "layouts.apart", "None: a fleet is a task for each of its vehicles, of_vehicle(v)", layouts.apart
+            )
         device = check_device(device)
         if layouts.dimension != self.dimension:
             states = layouts.start if layouts.start is not None else layouts.goal
-            wanted = fitting(layouts.dimension, None if states is None else states.shape[1])
+            wanted = fitting(layouts.dimension, None if states is None else states.shape[-1])
             raise InputError("model", f"{wanted} for the {layouts.dimension}-D {layouts.name}", self.name)
         whole = self.completed(layouts)
         assert whole.goal_radius is not None and whole.stages is not None
@@ -297,9 +303,9 @@ class Vehicle:
         moved = {}
         for name in ("start", "goal"):
             points = getattr(layouts, name)
-            if points is not None and points.shape[1] == layouts.dimension == self.dimension:
-                moved[name] = np.tile(np.array(getattr(self, name), np.float64), (layouts.count, 1))
-                moved[name][:, self.dynamics.position] = points
+            if points is not None and points.shape[-1] == layouts.dimension == self.dimension:
+                moved[name] = np.tile(np.array(getattr(self, name), np.float64), (*points.shape[:-1], 1))
+                moved[name][..., self.dynamics.position] = points
         return replace(layouts, **moved) if moved else layouts
 
     def _states(self, layouts: Layouts, name: str):
@@ -307,9 +313,9 @@ class Vehicle:
         states = getattr(layouts, name)
         if states is None:
             return np.array([list(getattr(self, name))] * layouts.count, np.float64)
-        if states.shape[1] != self.dynamics.n:
+        if states.shape[-1] != self.dynamics.n:
             wanted = f"{self.dynamics.n} states of model={self.name}, or {self.dimension} coordinates"
-            raise InputError(f"layouts.{name}", wanted, states.shape[1])
+            raise InputError(f"layouts.{name}", wanted, states.shape[-1])
         return states
 
 

@@ -56,19 +56,30 @@ def show_fleet(members: Sequence[Problem], solutions: Sequence[Solution]) -> Htm
     Args:
         members: a problem per vehicle, of B fleets, all with a radius where they have obstacles.
     """
+    document = fleet_document(members, "torchgco", f"{members[0].B} fleets of {len(members)} vehicles")
+    add_fleets(document, members, solutions, [f"fleet {b}" for b in range(members[0].B)])
+    return HtmlPage(page(document), "Fleets among obstacles")
+
+
+def fleet_document(members: Sequence[Problem], title: str, about: str) -> Document:
+    """The page of fleets in the making, with a colour for each vehicle."""
     first, names = members[0], [f"vehicle {v}" for v in range(len(members))]
+    dt, look = float(first.dynamics.dt), look_of(first.dynamics)
+    return Document.of(first, title=title, about=f"{about}, {first.N} stages", dt=dt, look=look, solvers=names)
+
+
+def add_fleets(
+    document: Document, members: Sequence[Problem], solutions: Sequence[Solution], labels: Sequence[str]
+) -> None:
+    """Add fleets to their page, under these names."""
     flights = []
-    for name, one, found in zip(names, members, solutions, strict=True):
+    for name, one, found in zip(document.solvers, members, solutions, strict=True):
         rows, results, touching = _told(one, found)
         flights.append(
             flights_of(one, look_of(one.dynamics), found.X, found.U, name, results, rows, ADMITTED, touching)
         )
-    about = f"{first.B} fleets of {len(members)} vehicles, {first.N} stages"
-    dt, look = float(first.dynamics.dt), look_of(first.dynamics)
-    document = Document.of(first, title="torchgco", about=about, dt=dt, look=look, solvers=names)
-    for b in range(first.B):
-        document.add(f"fleet {b}", first, b, [each[b] for each in flights])
-    return HtmlPage(page(document), "Fleets among obstacles")
+    for b, label in enumerate(labels):
+        document.add(label, members[0], b, [each[b] for each in flights])
 
 
 def _times(problem: Problem, solution: Solution) -> tuple[np.ndarray | None, float]:

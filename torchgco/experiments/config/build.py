@@ -24,6 +24,8 @@ from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, config_dir, reg
 from torchgco.experiments.config.launching import allotted_cores
 from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.results.identity import settings_of
+from torchgco.fleets.drawn import fleet_of
+from torchgco.fleets.fleet import Fleet
 from torchgco.kernels import use_native
 from torchgco.missions import Mission, RaceMission
 from torchgco.missions.mission import OTHER_MODELS
@@ -84,10 +86,16 @@ class Setup:
             raise InputError(field, f"a problem that fits into the free memory, {_gigabytes(free)}", got)
         arrays = replace(first, map=None).arrays()
         of_map = first.map.values.nbytes if first.map is not None and not self.scenario.shares_map else 0
-        flights = count * (sum(array.nbytes for array in arrays.values()) + of_map + 8 * N * dynamics.m)
+        flights = count * (
+            sum(array.nbytes for array in arrays.values()) + of_map + 8 * N * dynamics.m * (first.vehicles or 1)
+        )
         if flights > free:
             got = f"{count}, {_gigabytes(flights)} or more"
             raise InputError("study.layouts", f"layouts that fit into the free memory, {_gigabytes(free)}", got)
+
+    def fleet(self, layouts: Layouts | None = None) -> Fleet:
+        """The fleets of some layouts (default: `layouts()`)."""
+        return fleet_of(self.vehicle, layouts or self.layouts())
 
     def task(self, layouts: Layouts | None = None) -> Task:
         """The planning problems of some layouts (default: `layouts()`) on the configured device."""

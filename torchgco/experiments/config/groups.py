@@ -83,9 +83,8 @@ def scenarios_for(model: str) -> list[str]:
 def _model_of(made: Any) -> str:
     """The built-in model that flies a family's layouts unless a command names another."""
     if made.states is None:  # positions alone
-        return ANYWHERE[made.dimension]
-    (model,) = (name for name, space in BUILT_IN.items() if space == (made.dimension, made.states))
-    return model
+        return made.model or ANYWHERE[made.dimension]
+    return next(name for name, space in BUILT_IN.items() if space == (made.dimension, made.states))
 
 
 def register() -> None:

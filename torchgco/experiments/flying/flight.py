@@ -122,6 +122,16 @@ class Batch(ABC):
         """Of the study."""
         return self.tasks.setup
 
+    @property
+    def shared(self) -> dict[str, Any]:
+        """Columns that all rows of the batch share."""
+        setup = self.setup
+        return {
+            "scenario": self.tasks.layouts.name, "seed": setup.seed, "model": setup.vehicle.name, "solver": self.name,
+            "threads": torch.get_num_threads(), "device": setup.device.type,
+            "dtype": str(setup.dtype).removeprefix("torch."), "version": VERSION,
+        }  # fmt: skip
+
     @cached_property
     def layouts(self) -> Layouts:
         """Of this batch."""
@@ -193,16 +203,13 @@ class SolveBatch(Batch):
         certificate = _certificate(checked.problem, X, U, verdict.feasible, solution, times)
         rows = pd.DataFrame(
             {
-                "scenario": layouts.name, "layout": layouts.ids, "seed": setup.seed, "model": setup.vehicle.name,
-                "solver": self.name, "status": statuses, **frame_columns(verdict),
+                **self.shared, "layout": layouts.ids, "status": statuses, **frame_columns(verdict),
                 **durations(times), **more_columns(checked.problem, verdict),
                 **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
-                "threads": torch.get_num_threads(), "device": setup.device.type,
-                "dtype": str(setup.dtype).removeprefix("torch."),
-                "kernels": (solution.account and solution.account.kernels) or "", "version": VERSION,
+                "kernels": (solution.account and solution.account.kernels) or "",
             }
         )  # fmt: skip
         return rows, U.numpy() if times is None else with_lengths(U.numpy(), times.numpy())

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import torch
 
-from torchgco.base.version import VERSION
 from torchgco.experiments.flying.flight import Batch
 from torchgco.exploration.safety import safe_arrays
 from torchgco.missions.contact import Contact
@@ -56,14 +55,11 @@ class MissionBatch(Batch):
         return pd.DataFrame(rows), packed(arrays)
 
     def _row(self, b: int, outcome: Outcome) -> dict[str, Any]:
-        setup = self.setup
         return {
-            "scenario": self.layouts.name, "layout": int(self.layouts.ids[b]), "seed": setup.seed,
-            "model": setup.vehicle.name, "solver": self.name, "status": outcome.name,
+            **self.shared, "layout": int(self.layouts.ids[b]), "status": outcome.name,
             "feasible": outcome not in FAILED, "reached": outcome == Outcome.REACHED, "clear_95": outcome not in FAILED,
             **dict.fromkeys(SINGLE, np.nan),
-            "batch_size": self.layouts.count, "threads": torch.get_num_threads(), "device": setup.device.type,
-            "dtype": str(setup.dtype).removeprefix("torch."), "kernels": "", "version": VERSION,
+            "batch_size": self.layouts.count, "kernels": "",
         }  # fmt: skip
 
     def _progress(self, period: float, duration: float, step: int, flying: int) -> None:

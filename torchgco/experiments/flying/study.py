@@ -18,12 +18,14 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
+from torchgco.experiments.flying.fleet_flight import FleetBatch, check_fleets
 from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, fly, plan_of, prepare
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionBatch
 from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.workers import Shared, run_all
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
+from torchgco.experiments.reports.fleet_report import write_fleet_report
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.reports.view import write_view
@@ -129,7 +131,7 @@ def _fly_and_report(study: _Study, store: StudyFolder, collect: bool, swept: Seq
     trials = store.table()
     if study.plan.explain:
         say(explained(study.tasks, trials))
-    elif study.setup.mission is None and (state := advised(study.tasks, trials)):
+    elif study.setup.mission is None and study.layouts.vehicles is None and (state := advised(study.tasks, trials)):
         say(state)
     say(f"\nTable, arrays and figures: {folder}")
     if study.plan.view:
@@ -174,14 +176,19 @@ def _report(study: _Study, folder: Path) -> str:
     if study.setup.mission is not None:
         return write_mission_report(folder, study.tasks, figures=study.plan.figures)
     plan = study.plan
+    if study.layouts.vehicles is not None:
+        return write_fleet_report(folder, study.setup.vehicle, study.layouts, plan.figures)
     return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.tasks)
 
 
 def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
     setup = build(configuration)
     tasks = Tasks(setup, setup.layouts())
-    task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
-    plan = plan_of(setup)
+    plan, fleets = plan_of(setup), tasks.layouts.vehicles is not None
+    if fleets:
+        check_fleets(setup, tasks.layouts, plan)
+    else:
+        task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
     if (objective := configuration["study"]["objective"]) is not None:
         check_objective(objective, setup.mission is not None)
         if plan.jobs is not None:
@@ -194,7 +201,7 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
             raise InputError("study.figure", "null for missions, which have figures of their own", plan.figure)
     rivals = _rivals(configuration, recompose)
     solvers = {name: setup.solver if config is configuration else solver_of(config) for name, config in rivals.items()}
-    if setup.mission is None:
+    if setup.mission is None and not fleets:
         _check_time(task, solvers)
     plant = None if setup.mission is None else setup.mission.plant
     decided = {**configuration, **files_of(configuration, getattr(plant, "files", ()))}
@@ -274,8 +281,9 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar, alone: bool 
     tasks, solver = study.tasks, study.solvers[name]
     tasks, places = (tasks.part(ids), range(len(ids))) if alone else (tasks, ids)
     if study.setup.mission is None:
+        batch = SolveBatch if study.layouts.vehicles is None else FleetBatch
         most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
-        return SolveBatch(tasks, places, name, solver, bar, most)
+        return batch(tasks, places, name, solver, bar, most)
     return MissionBatch(tasks, places, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
 
 

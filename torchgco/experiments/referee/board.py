@@ -85,7 +85,7 @@ class Scene:
 def usual_model(layouts: Layouts) -> str:
     """The built-in model that flies layouts; InputError where none has as many states."""
     ends = layouts.start if layouts.start is not None else layouts.goal
-    states = layouts.dimension if ends is None else ends.shape[1]
+    states = layouts.dimension if ends is None else ends.shape[-1]
     if states == layouts.dimension:
         return ANYWHERE[layouts.dimension]
     for name, space in BUILT_IN.items():

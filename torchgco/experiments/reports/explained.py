@@ -48,6 +48,8 @@ def advised(tasks: Tasks, trials: pd.DataFrame) -> str:
 
 def where_to_start(tasks: Tasks) -> str:
     """What a study needs all of whose layouts begin inside an obstacle."""
+    if tasks.layouts.vehicles is not None:
+        return "fleets of which one starts outside its obstacles"
     problem = tasks.of([0], exact=True).problem
     unknown = map_facts(problem, Status.INVALID_START, False)["in_unknown"]
     free = ", or scenario.unknown=free, as unknown cells count as occupied" if unknown else ""

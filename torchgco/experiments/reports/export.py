@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -33,7 +34,7 @@ from torchgco.problem.times import times
 
 FOLDER = "export"
 ATTITUDE_STATES, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states
-Table = tuple[str, int, pd.DataFrame]  # solver, layout, columns
+Table = tuple[str, int, str, pd.DataFrame]  # solver, layout, what its name ends with, columns
 
 
 def write_export(
@@ -74,9 +75,10 @@ def write_export(
     named = trials[[*PAIR, "solver", *swept_columns(trials)]]
     rows: dict[Any, Any] = dict(zip(named.index, named.to_dict("records"), strict=True))
     tables, written = _missions if study.missions else _trajectories, list[Path]()
-    for solver, number, columns in tables(study, rate, lambda solver, number: number in (layouts or ids)):
+    for solver, number, ending, columns in tables(study, rate, lambda solver, number: number in (layouts or ids)):
         if solver in (solvers or names):
-            written.append(target / (f"{solver}-{number}" if bag else f"{solver}-{number}.csv"))
+            label = f"{solver}-{number}{ending}"
+            written.append(target / (label if bag else f"{label}.csv"))
             target.mkdir(parents=True, exist_ok=True)
             if bag:
                 write_bag(written[-1], {name: columns[name].to_numpy() for name in columns}, _position(study), bag)
@@ -94,11 +96,23 @@ def _position(study: Study) -> list[str]:
 
 
 def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
-    """Single trajectories, rolled out from the controls that the study kept."""
+    """Single trajectories, rolled out from the controls that the study kept; of fleets one of each vehicle."""
+    if study.layouts.vehicles is None:
+        yield from _of_one(study, rate, wanted, slice(None), "")
+    m = study.vehicle.dynamics.m
+    for v in range(study.layouts.vehicles or 0):
+        one = replace(study, layouts=study.layouts.of_vehicle(v))
+        yield from _of_one(one, rate, wanted, slice(v * m, (v + 1) * m), f"-{v}")
+
+
+def _of_one(
+    study: Study, rate: float | None, wanted: Callable[[str, int], bool], columns_of: slice, ending: str
+) -> Iterator[Table]:
+    """The trajectories of one vehicle, whose controls are some of those that the study kept."""
     all_times = study.times
     for places, problem in study.batches():
         for name, controls in study.flown(SOLUTIONS, "U").items():
-            U = torch.from_numpy(controls[places, : problem.N])
+            U = torch.from_numpy(controls[places, : problem.N, columns_of].copy())
             knot_times = durations.times_at(None if all_times is None else all_times[name], places, problem.N)
             X = durations.states_of(problem, U, knot_times)
             t = times(problem).expand(problem.B, -1) if knot_times is None else knot_times
@@ -107,7 +121,7 @@ def _trajectories(study: Study, rate: float | None, wanted: Callable[[str, int],
                 if wanted(name, number) and bool(torch.isfinite(U[b, :last]).all()):
                     dynamics = problem.take(slice(b, b + 1)).dynamics
                     columns = sampled(dynamics, X[b, : last + 1], U[b, :last], t[b, : last + 1], rate)
-                    yield name, number, pd.DataFrame(columns)
+                    yield name, number, ending, pd.DataFrame(columns)
 
 
 def _missions(study: Study, rate: float | None, wanted: Callable[[str, int], bool]) -> Iterator[Table]:
@@ -116,7 +130,7 @@ def _missions(study: Study, rate: float | None, wanted: Callable[[str, int], boo
     kept = {} if fine is None else dict(iter(fine.groupby(["solver", "mission"], sort=False)))
     for (name, number), steps in study.log.groupby(["solver", "mission"], sort=False):  # type: ignore[misc]
         if wanted(name, number):
-            yield name, number, _flown(kept.get((name, number), steps), rate)
+            yield name, number, "", _flown(kept.get((name, number), steps), rate)
 
 
 def _flown(log: pd.DataFrame, rate: float | None) -> pd.DataFrame:

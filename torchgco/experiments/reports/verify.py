@@ -20,6 +20,7 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import vehicle_of
+from torchgco.experiments.flying.fleet_flight import fleet_columns
 from torchgco.experiments.flying.mission_flight import FAILED
 from torchgco.experiments.results.durations import durations, times_at
 from torchgco.experiments.results.files import damaged, readable
@@ -41,6 +42,7 @@ from torchgco.experiments.results.success import with_success
 from torchgco.experiments.results.variants import values_of
 from torchgco.experiments.statistics.statistics import swept_columns
 from torchgco.experiments.statistics.tables import aligned, csv_text
+from torchgco.fleets.drawn import solution_of
 from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
@@ -133,7 +135,8 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     if not trust:
         check_stages(folder, vehicle, layouts, BATCH)
     try:
-        judged = partial(_missions if missions else _trajectories, trust)
+        single = _trajectories if layouts.vehicles is None else _fleets
+        judged = partial(_missions if missions else single, trust)
         computed = judged(folder, vehicle, manifest, layouts, kept).reindex(kept.index)
     except (InputError, KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError) and error.field in ("hydra.run.dir", "RUN"):
@@ -201,6 +204,20 @@ def _trajectories(
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
     return rows.set_index(TRIAL)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
+
+
+def _fleets(
+    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, stored_rows: pd.DataFrame
+) -> pd.DataFrame:
+    """The judged columns of fleets, by (solver, layout)."""
+    arrays, parts = readable(folder / SOLUTIONS, read_npz, trust=trust), []
+    for name, U in zip(arrays["solver"].tolist(), arrays["U"], strict=True):
+        for places in layouts.together(BATCH):
+            some = layouts.take(places)
+            columns = fleet_columns(solution_of(vehicle, some, U[places]).verdict)
+            parts.append(pd.DataFrame({"solver": name, "layout": some.ids, **columns}))
+    rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
+    return rows.set_index(TRIAL)[[*columns, "success", "best_cost", "best_from"]]
 
 
 def _missions(

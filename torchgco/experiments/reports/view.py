@@ -13,16 +13,18 @@ import torch
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.progress import page_bar
-from torchgco.experiments.reports.finished import Study, document_of
+from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study, document_of
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
 from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
+from torchgco.fleets.drawn import solution_of
 from torchgco.obstacles.base import ADMITTED
 from torchgco.view.document import Document, SearchPart
 from torchgco.view.flights import Rows, flights_of
+from torchgco.view.notebook import add_fleets, fleet_document
 from torchgco.view.page import page
 from torchgco.view.vehicles import look_of
 
@@ -43,6 +45,10 @@ def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) 
     missing = sorted(set(searched) - set(study.layouts.ids.tolist()))
     if missing:
         raise InputError("--search", "numbers of layouts of the study", missing[0])
+    if study.layouts.vehicles is not None:
+        if searched:
+            raise InputError("--search", "no numbers of fleets: single solves can be searched", searched[0])
+        return page(_fleets(study))
     parts = searches(study, searched) if searched else {}
     return page(missions(study, parts) if study.missions else _trajectories(study, parts))
 
@@ -74,6 +80,24 @@ def _trajectories(study: Study, searched: Mapping[int, SearchPart]) -> Document:
     bar.close()
     assert document is not None
     document.ordered(np.argsort(np.concatenate(order)).tolist())
+    return document
+
+
+def _fleets(study: Study) -> Document:
+    """Fleets, rolled out from the controls that the study kept, a colour for each vehicle."""
+    document, controls = None, study.flown(SOLUTIONS, "U")
+    for places in study.layouts.together(MEASURED_AT_ONCE):
+        layouts = study.layouts.take(places)
+        for name, U in controls.items():
+            found = solution_of(study.vehicle, layouts, U[places])
+            if document is None:
+                about = f"{study.layouts.count} fleets of {found.fleet.V}, {study.vehicle.name}, seed {study.seed}"
+                title = f"{study.trials['scenario'].iloc[0]}: {', '.join(controls)}"
+                document = fleet_document(found.fleet.members, title, about)
+            said = f", {name}" if len(controls) > 1 else ""
+            labels = [f"fleet {number}{said}" for number in layouts.ids.tolist()]
+            add_fleets(document, found.fleet.members, found.vehicles, labels)
+    assert document is not None
     return document
 
 

@@ -184,7 +184,7 @@ def _shared(layouts: Layouts, vehicle: Mapping[str, Any]) -> dict[str, Any]:
     values: dict[str, Any] = {"model": model, "dt": layouts.dt}
     for key, field in OVERRULED.items():
         values[key] = vehicle.get(key) if (value := getattr(layouts, field)) is None else value
-    values |= {name: value for name in (TIME, BINDS) if (value := getattr(layouts, name)) is not None}
+    values |= {name: value for name in (TIME, BINDS, "apart") if (value := getattr(layouts, name)) is not None}
     if layouts.map is not None and layouts.map.batch is None:
         values["map"] = _map_digests(layouts.map)
     return values

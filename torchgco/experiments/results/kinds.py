@@ -13,6 +13,7 @@ from torchgco.experiments.results.files import write
 from torchgco.experiments.statistics.missions import MISSIONS_AT_ONCE, summarise_missions
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import (
+    MAKESPAN,
     OUTCOMES,
     PAPER_OUTCOME,
     TASK,
@@ -73,6 +74,11 @@ TRAJECTORIES = Kind(
     paper=("n", "cost ratio", "iter.", "seconds"),
     compared={**PAIR_CELLS, "cost ratio": cost_ratio},
     statuses=True,
+    more_effort=lambda task: (
+        {MAKESPAN: number("{:.2f} ({:.2f}) s", f"{MAKESPAN}_median", f"{MAKESPAN}_p90")}
+        if f"{MAKESPAN}_median" in task and task[f"{MAKESPAN}_median"].notna().any()
+        else {}
+    ),
     more_rates=lambda task: {PAPER_OUTCOME: rate(PAPER_OUTCOME)} if (task["solver"] == PAPER_SOLVER).any() else {},
     notes=f"{RATES_TEXT}\n{EFFORT_TEXT}",
 )

@@ -105,7 +105,7 @@ def check_stages(folder: Path, vehicle: Vehicle, layouts: Layouts, most: int) ->
         InputError: they do.
     """
     count, stages = min(most, layouts.count), vehicle.stages if layouts.stages is None else int(np.max(layouts.stages))
-    size = count * stages * (vehicle.dynamics.n + vehicle.dynamics.m) * NUMBER_BYTES
+    size = count * stages * (vehicle.dynamics.n + vehicle.dynamics.m) * (layouts.vehicles or 1) * NUMBER_BYTES
     if size > LARGEST_FILE:
         refuse(folder, f"{count} trajectories of {stages} stages, {size / 1e9:.3g} GB")
 

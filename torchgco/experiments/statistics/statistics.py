@@ -23,6 +23,7 @@ PAPER_OUTCOME = "clear_95"  # the paper's notion of feasible
 TASK = ["scenario", "model"]
 PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
+MAKESPAN = "makespan"  # of fleets
 NEEDED_COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, PAPER_OUTCOME, "violation", "cost", *EFFORT]
 NUMBER_COLUMNS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 TEXTS = ("string", "categorical", "bytes")  # kinds of columns without numbers, as pandas calls them
@@ -90,6 +91,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
             and have a positive best cost.
         <effort>_median, _p90: iterations, outer_iterations, guided and seconds over the trials with a valid start; nan
             if one of them lacks the number.
+        makespan_median, _p90: of fleets that reached their goals.
         status_<NAME>: trials that ended with this status; missions: with this outcome.
 
     _p90 is the 90 % quantile, interpolated linearly.
@@ -121,6 +123,7 @@ class _Values:
         numbers = {name: numbers_of(trials[name]) for name in ("violation", "cost", *EFFORT)}
         numbers["violation"] = np.nan_to_num(numbers["violation"], nan=np.inf, posinf=np.inf)
         best = numbers_of(trials["best_cost"]) if "best_cost" in trials.columns else np.full(len(trials), nan)
+        numbers |= {MAKESPAN: numbers_of(trials[MAKESPAN])} if MAKESPAN in trials.columns else {}
         numbers["cost_ratio"] = numbers["cost"] / np.where(best > 0, best, nan)
         status, statuses = pd.factorize(trials["status"])
         hits = attained(trials, groups)
@@ -148,6 +151,8 @@ class _Values:
         }
         for name in EFFORT:
             row |= _quantiles(name, selected[name][valid])
+        if MAKESPAN in selected:
+            row |= _quantiles(MAKESPAN, selected[MAKESPAN][reached])
         counts = np.bincount(self.status[rows], minlength=len(self.statuses)).tolist()
         return row | {f"{STATUS}{name}": count for name, count in zip(self.statuses, counts, strict=True)}
 

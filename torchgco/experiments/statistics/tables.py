@@ -32,7 +32,7 @@ class Kind:
         of: said before the name of a task.
         statuses: whether statuses are counted in a table of their own.
         effort_note: what is said below the effort of a task, from its summary.
-        more_rates: further columns of rates, from a summary.
+        more_rates, more_effort: further columns of these, from a summary.
     """
 
     name: str
@@ -46,6 +46,7 @@ class Kind:
     statuses: bool = False
     effort_note: Callable[[pd.DataFrame], str] = lambda task: ""
     more_rates: Callable[[pd.DataFrame], Columns] = lambda task: {}
+    more_effort: Callable[[pd.DataFrame], Columns] = lambda task: {}
 
     def text(self, summary: pd.DataFrame, paired: pd.DataFrame) -> str:
         """The report for a terminal, some 120 columns wide: rates, effort, statuses and comparisons of each task.
@@ -60,7 +61,7 @@ class Kind:
             seeds, swept = dict.fromkeys(seed for text in task["seed"] for seed in text.split()), swept_of(task)
             blocks.append(f"{self.of}{scenario} ({model}), seed {', '.join(seeds)}")
             blocks.append(_lines(task, swept, solver() | self.rates | self.more_rates(task)))
-            blocks.append(_lines(task, swept, solver() | self.effort) + self.effort_note(task))
+            blocks.append(_lines(task, swept, solver() | self.effort | self.more_effort(task)) + self.effort_note(task))
             if self.statuses:
                 blocks.append(_lines(task, swept, solver() | _statuses(task)))
             rows = paired[(paired["scenario"] == scenario) & (paired["model"] == model) & (paired["n"] > 0)]
