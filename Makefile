@@ -50,10 +50,10 @@ study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
 
 test: $(DEV)
-	$(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal $(ARGS)
 
 test-all: $(DEV)
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not slurm" $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slurm" $(ARGS)
 
 test-slurm: $(DEV)
 	$(BIN)/python -m pytest -m slurm $(ARGS)

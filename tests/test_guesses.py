@@ -159,6 +159,15 @@ def test_columns_files_and_parts_know_the_guess(tmp_path: Path) -> None:
     assert solution.account is not None and solution.account.problem is problem
 
 
+@pytest.mark.parametrize("pace", [-1.0, 0.0])
+def test_times_that_do_not_rise_are_refused(pace: float) -> None:
+    """They were moved into the bounds of the time without a word."""
+    problem = pendulums()
+    free = replace(problem, time=FreeTime(0.5, 2.0, weight=1.0))
+    with pytest.raises(InputError, match=r"guesses\[0\]\.times: expected times that rise"):
+        torchgco.solve(free, guesses=[Guess(times=pace * torch.linspace(0.0, 2.0, problem.N + 1).double())])
+
+
 @pytest.mark.parametrize(
     "guesses, others, field",
     [

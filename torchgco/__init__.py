@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchgco import kernels as kernels
 from torchgco import presets, sensitivity
-from torchgco.api import animate, compare, plot, show, solve
+from torchgco.api import compare, solve
 from torchgco.base.errors import (
     ContactWarning,
     DeviceWarning,
@@ -66,13 +66,15 @@ from torchgco.dynamics import (
 )
 from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
-from torchgco.fleets.judging import judge
 from torchgco.guesses import Guess
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres
+from torchgco.phases import Jump, Phases, PhasesSolution
+from torchgco.phases.judging import judge
+from torchgco.pictures import animate, plot, show
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
@@ -81,6 +83,7 @@ from torchgco.scenarios import Layouts
 from torchgco.search import MultiStart, PathProposals, Restarts
 from torchgco.solution import Solution
 from torchgco.solvers import ILQR, AugmentedLagrangian, InteriorPoint, LineSearch, plan_batch
+from torchgco.tightened import tightened
 
 if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage as HtmlPage
@@ -98,9 +101,9 @@ __all__ = [  # noqa: RUF022
     # maps
     "Field", "DistanceField", "OccupancyGrid", "PointCloud",
     # solving it
-    "solve", "Guess", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
+    "solve", "Guess", "tightened", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "animate", "show", "Status", "presets",
-    "Fleet", "FleetSolution", "FleetMPC",
+    "Fleet", "FleetSolution", "FleetMPC", "Phases", "Jump", "PhasesSolution",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result

@@ -1,4 +1,4 @@
-"""solve: one call with a default solver, for notebooks and first steps."""
+"""solve and compare: one call with a default solver, for notebooks and first steps."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from torchgco.guesses import Guess, guesses_of, solve_guesses
 from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
+from torchgco.phases import Phases, PhasesSolution
+from torchgco.phases.solve import solve_phases
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import guessing_times
@@ -39,10 +41,6 @@ from torchgco.warned import warn_of
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.animation import FuncAnimation
-    from matplotlib.figure import Figure
-
-    from torchgco.base.html import HtmlPage
 
 LEAST_SECONDS = 1e-3  # of a solve for whose fleet no time is left
 
@@ -73,24 +71,37 @@ def solve(
     max_seconds: float | None = None,
     verbose: bool | None = None,
 ) -> FleetSolution: ...
-
-
+@overload
 def solve(
-    problem: Problem | Fleet,
-    U0: Tensor | None = None,
+    problem: Phases,
+    U0: Sequence[Tensor | None] | None = None,
+    *,
     solver: Solver | str | None = None,
     seed: int = 0,
     ids: Tensor | None = None,
-    warm: Solution | None = None,
+    warm: PhasesSolution | None = None,
     max_seconds: float | None = None,
-    X0: Tensor | None = None,
+    X0: Sequence[Tensor | None] | None = None,
+    verbose: bool | None = None,
+) -> PhasesSolution: ...
+
+
+def solve(
+    problem: Problem | Fleet | Phases,
+    U0: Any = None,
+    solver: Solver | str | None = None,
+    seed: int = 0,
+    ids: Tensor | None = None,
+    warm: Any = None,
+    max_seconds: float | None = None,
+    X0: Any = None,
     record: bool = False,
     verbose: bool | None = None,
     smoothing: float | None = None,
     guesses: Sequence[Guess | Solution | Mapping[str, Any]] | None = None,
     **misplaced: Never,
-) -> Solution | FleetSolution:
-    """Solve every problem of the batch; of a `Fleet` all vehicles, of which solver, seed, ids and max_seconds are.
+) -> Solution | FleetSolution | PhasesSolution:
+    """Solve every problem of the batch; all vehicles of a `Fleet`; all `Phases`, with a list of U0 and of X0.
 
     A ContactWarning names feasible trajectories that touch an obstacle between knots; a ScaleWarning those with a
     violation that is large beside its row; a StepWarning those with too long a `dt` for the model; a HorizonWarning
@@ -122,9 +133,9 @@ def solve(
             solve has no such argument, or a function that branches on values mixes knots or problems in what is found.
     """
     check_untransformed("solve")
-    if isinstance(problem, Fleet):
-        others = {"U0": U0, "warm": warm, "X0": X0, "record": record or None, "smoothing": smoothing}
-        return _solve_fleet(problem, others | {"guesses": guesses, **misplaced}, solver, seed, ids, max_seconds)
+    others = {"record": record or None, "smoothing": smoothing, "guesses": guesses, **misplaced}
+    if isinstance(problem, Phases | Fleet):
+        return _solve_parts(problem, others, solver, {"U0": U0, "X0": X0, "warm": warm}, seed, ids, max_seconds)
     asked = problem = current_problem(problem)
     warm, solver = _checked(warm), "gco" if solver is None else solver
     differentiates, smoothing = asks_for_gradients(problem), check_smoothing(problem, smoothing)
@@ -188,6 +199,29 @@ def _solve_fleet(
         return solve(problem, max_seconds=left, verbose=False, **options)
 
     return solve_fleet(fleet, own, seed, ids, "gco" if solver is None else solver, ends)
+
+
+def _solve_parts(
+    parts: Phases | Fleet,
+    others: Mapping[str, Any],
+    solver: Solver | str | None,
+    guess: dict[str, Any],
+    seed: int,
+    ids: Tensor | None,
+    max_seconds: float | None,
+) -> PhasesSolution | FleetSolution:
+    if isinstance(parts, Fleet):
+        return _solve_fleet(parts, guess | dict(others), solver, seed, ids, max_seconds)
+    expected = "None of phases: they have U0, X0, solver, seed, ids, warm and max_seconds"
+    if given := [name for name, value in others.items() if value is not None]:
+        raise InputError(f"solve.{given[0]}", expected, given[0])
+    if guess["warm"] is not None and (guess["U0"], guess["X0"]) != (None, None):
+        raise InputError("warm", "None beside U0 and X0", "a solution")
+    if any(map(asks_for_gradients, parts.members)):
+        expected = "tensors without gradients, or a call within torch.no_grad(): solutions of phases have none"
+        raise InputError("phases", expected, "some that ask for them")
+    made = _solver("interior_point" if solver is None else solver, parts.members[0], False)
+    return solve_phases(parts, made, **guess, seed=seed, ids=ids, max_seconds=max_seconds, rest=_within_bounds)
 
 
 def compare(
@@ -318,93 +352,31 @@ def _start(warm: Solution | None, solver: Solver, U0: Tensor | None, problem: Pr
     return problem, _guess(problem, whole)
 
 
-def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | Sequence[int] | None = None) -> Figure:
-    """The scene with the trajectories, then states and controls over time, with their bounds dashed.
-
-    Of a fleet a colour for each vehicle, with squares where they start and stars at their goals, then how far each is
-    from the nearest other one.
-
-    In space obstacles are cut at the height, in the side view at the y, that the first trajectory has there; crosses
-    mark contact, between the knots too. Bounds far from all values are left out. A notebook shows the figure;
-    `figure.savefig("name.pdf")` writes it.
-
-    Args:
-        problem, solution: as solved.
-        b: the place of a problem in the batch, or several; None: the first six. Those with the same obstacles and goal
-            share a scene. Of a fleet one place; None: the first.
-
-    Raises:
-        InputError: a place that isn't there, or a solution of other problems.
-    """
-    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
-        return _fleet_figure(problem, solution, b)
-    from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
-
-    return solution_figure(problem, solution.detach(), b)
-
-
-def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
-    from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
-
-    _fleet_of(fleet, solution)
-    members, X, U, distances = solution.arrays()
-    return fleet_figure(members, X, U, distances, b)
-
-
-def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[Solution]]:
-    if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
-        raise InputError("solution", "a fleet and its solution", type(solution).__name__)
-    return fleet.members, solution.vehicles
-
-
-def animate(problem: Problem, solution: Solution, b: int | Sequence[int] = 0) -> FuncAnimation:
-    """A film of trajectories among obstacles, also those that move, at 20 pictures a second in real time.
-
-    A notebook plays it; `.save("way.gif")` writes it, and where ffmpeg is installed `.save("way.mp4")`. In space from
-    above and from the side. Flights of over 12 s are shown faster.
-
-    Args:
-        problem, solution: as solved.
-        b: the place of a problem in the batch, or several among the same obstacles.
-
-    Raises:
-        InputError: a place that isn't there, a solution of other problems, other obstacles, or dynamics without a
-            position in 2-D or 3-D.
-    """
-    from torchgco.plotting.animated import solution_film  # matplotlib takes a second to load
-
-    return solution_film(problem, solution.detach(), b)
-
-
-def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPage:
-    """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
-
-    Of fleets with a colour for each vehicle.
-
-    Raises:
-        InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
-    """
-    from torchgco.view import notebook  # slow to load
-
-    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
-        return notebook.show_fleet(*_fleet_of(problem, solution))
-    return notebook.show(problem, solution.detach())
-
-
 def _guess(problem: Problem, whole: Problem) -> Tensor:
-    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows.
+    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these or overflows."""
+    with computing_on(problem.x0.device):
+        rest, middle, outside = _at_rest(problem)
+        next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
+        lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)
+        return torch.where(outside.logical_or(lost).view(-1, 1, 1), middle, rest)
+
+
+def _within_bounds(problem: Problem) -> Tensor:
+    """Controls (B, N, m) at rest; the middle of their bounds where rest breaks these."""
+    rest, middle, outside = _at_rest(problem)
+    return torch.where(outside.view(-1, 1, 1), middle, rest)
+
+
+def _at_rest(problem: Problem) -> tuple[Tensor, Tensor, Tensor]:
+    """Controls (B, N, m) at rest, those in the middle of their bounds, and where (B,) the former break these.
 
     A bound at infinity has no middle: there the other bound, or rest. Bounds on norms and cones move both inside.
     """
-    with computing_on(problem.x0.device):
-        rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
-        rest = within_norms(rest, problem.constraints)
-        middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
-        for bounds in bounds_of(problem.constraints, "u"):
-            held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
-            outside[:, bounds.knots] |= (held < lower) | (held > upper)
-            middle[:, bounds.knots] = bounds.middle(held)
-        middle = within_norms(middle, problem.constraints)
-        next_factors = rest.new_ones(*rest.shape[:2], whole.m - problem.m)  # where the time is free
-        lost = ~torch.isfinite(open_loop(whole, torch.cat((rest, next_factors), dim=-1))).flatten(1).all(-1)
-        return torch.where(outside.flatten(1).any(-1).logical_or(lost).view(-1, 1, 1), middle, rest)
+    rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
+    rest = within_norms(rest, problem.constraints)
+    middle, outside = rest.clone(), torch.zeros_like(rest, dtype=torch.bool)
+    for bounds in bounds_of(problem.constraints, "u"):
+        held, (lower, upper) = rest[:, bounds.knots], bounds.by_knot
+        outside[:, bounds.knots] |= (held < lower) | (held > upper)
+        middle[:, bounds.knots] = bounds.middle(held)
+    return rest, within_norms(middle, problem.constraints), outside.flatten(1).any(-1)

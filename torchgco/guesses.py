@@ -44,7 +44,8 @@ class Guess(PerElement):
         times: of the knots (B, N+1), or (N+1,) for all problems, s, where the time is free.
 
     Raises:
-        InputError: on `solve`: other shapes, times where the time isn't free, or none beside states where it is.
+        InputError: on `solve`: other shapes, times that don't rise or where the time isn't free, or none beside states
+            where it is.
     """
 
     U0: Any = None
@@ -64,6 +65,8 @@ class Guess(PerElement):
         if made["times"] is not None:
             if problem.time is None:
                 raise InputError(f"{field}.times", "None, as the problem's time isn't free", "times")
+            if not bool((made["times"].diff(dim=1) > 0).all()):
+                raise InputError(f"{field}.times", "times that rise from knot to knot", "others")
             factors_of(problem, made["times"])
         return Guess(**made)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, ScaleWarning, StepWarning
 from torchgco.base.status import Status
 from torchgco.judging.scale import SHARE, dwarfed, noise
-from torchgco.judging.steps import step_errors
+from torchgco.judging.steps import Costates, step_errors
 from torchgco.judging.worst import NO_PLACE, kind_of
 from torchgco.kernels import costates
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
@@ -23,15 +23,19 @@ from torchgco.solvers.ending import touches
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 
 
-def warn_of(problem: Problem, solution: Solution, cold: bool) -> None:
-    """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it."""
+def warn_of(problem: Problem, solution: Solution, cold: bool, costates: Costates = costates) -> None:
+    """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it.
+
+    Args:
+        costates: as of `step_errors`.
+    """
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
     if solution.account is not None:
         problem = solution.account.problem or problem  # whose code may refuse states
     if cold:
         _warn_of_horizon(problem, solution, claims)
     _warn_of_scale(problem, solution, claims)
-    _warn_of_steps(problem, solution, claims)
+    _warn_of_steps(problem, solution, claims, costates)
     _warn_of_contact(problem, solution)
 
 
@@ -79,7 +83,7 @@ def _warn_of_scale(problem: Problem, solution: Solution, claims: Tensor) -> None
         )
 
 
-def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None:
+def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor, costates: Costates) -> None:
     """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
     rows = claims.nonzero().flatten()
     if rows.numel() == 0:
@@ -88,10 +92,15 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor) -> None
     times = None if solution.times is None else solution.times[rows]
     found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
     long = found.large.nonzero().flatten().tolist()
-    if long:
-        warnings.warn(
-            f"{len(long)} of {problem.B} trajectories take steps that are too long for their model: problem "
-            f"{int(rows[long[0]])}, where {found.told(long[0], problem)}; a smaller dt shows what is true",
-            StepWarning,
-            stacklevel=4,
+    if not long:
+        return
+    b, count = long[0], f"{len(long)} of {problem.B} trajectories"
+    told = f"{count} take steps that are too long for their model: problem {int(rows[b])}, where {found.told(b, part)}"
+    better = "a smaller dt"
+    if bool(found.of_cost[long].all()):
+        told = (
+            f"Euler's steps change the costs of {count} by over 1 %: of problem {int(rows[b])} by about "
+            f"{found.cost_told(b, 2.0)}"
         )
+        better = f'integrator="{"rk4" if part.dynamics.integrator == "euler" else "radau5"}", or a smaller dt,'
+    warnings.warn(f"{told}; {better} shows what is true", StepWarning, stacklevel=4)

@@ -14,6 +14,7 @@ from torchgco.experiments.referee.board import Scene, leaderboard
 from torchgco.experiments.referee.entries import Entry, entries_of, layouts_of
 
 COUNTS = ["layouts", "entry", "n", "reached_count", "success_count", "feasible_count"]
+PAIRS = [(name, entry) for name in ("planar_trap", "walls") for entry in METHODS]
 
 
 def test_its_page_and_table_have_all_entries_on_all_layouts() -> None:
@@ -29,14 +30,13 @@ def test_its_page_and_table_have_all_entries_on_all_layouts() -> None:
     assert len(lines) == len(board) + 2 and lines[2].startswith("| forest30 | ")
 
 
-@pytest.mark.parametrize("name", mostly(["planar_trap", "walls"], "walls"))
-def test_its_numbers_are_those_of_the_controls(name: str) -> None:
+@pytest.mark.parametrize(("name", "entry"), mostly(PAIRS, *PAIRS[1:], several=True))
+def test_its_numbers_are_those_of_the_controls(name: str, entry: str) -> None:
     board = pd.read_csv(BOARD / "board.csv").set_index(["layouts", "entry"])
     scene = Scene.read(BOARD / "layouts" / f"{name}.npz")
-    for entry in METHODS:
-        trials = scene.judged(scene.controls(BOARD / "entries" / entry / f"{name}.npz"))
-        assert trials["reached"].sum() == board.loc[(name, entry), "reached_count"], entry
-        np.testing.assert_allclose(trials["seconds"].median(), board.loc[(name, entry), "seconds_median"], rtol=1e-6)
+    trials = scene.judged(scene.controls(BOARD / "entries" / entry / f"{name}.npz"))
+    assert trials["reached"].sum() == board.loc[(name, entry), "reached_count"]
+    np.testing.assert_allclose(trials["seconds"].median(), board.loc[(name, entry), "seconds_median"], rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ def test_without_a_device_it_says_so(capsys) -> None:
     assert capsys.readouterr().out.strip() == gpu.NO_DEVICE
 
 
+@pytest.mark.slow
 @needs_gxx
 def test_its_page_says_how_many_problems_have_the_bits_of_c(monkeypatch) -> None:
     bench = gpu.Bench(OnDevice(Shim, 1), time.monotonic() + 600, [2], [40], ["planar_random", "pendulum"])

@@ -14,6 +14,7 @@ def test_functions_of_the_package_are_counted() -> None:
     assert overhead.counted(lambda: [len(str(i)) for i in range(9)]) == 0
 
 
+@pytest.mark.slow
 def test_each_case_has_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(overhead, "started", lambda words, own: "1.5")
     head, *rows = cells_of(overhead.table(["bicycle", "first"], 1))

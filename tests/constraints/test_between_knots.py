@@ -114,6 +114,44 @@ def test_stages_are_those_that_end_at_the_knots() -> None:
     assert problem.constraints[-1].value(*problem.at_rest).shape == (1, 2, 2)
 
 
+def swing(x: Tensor, u: Tensor) -> Tensor:
+    return torch.stack((x[..., 1], u[..., 0] - 9.0 * x[..., 0]), dim=-1)
+
+
+def drawn_limits(kind: str) -> tuple[Constraint, list[int]]:
+    """Rows with numbers of their own at each knot, and by which of these stage k has to keep them."""
+    draws = torch.Generator().manual_seed(3)
+    limits = torch.rand(1, 7, 2, generator=draws, dtype=torch.float64)
+    if kind == "bounds at 0 to N - 1":
+        return StateBounds(limits[:, :6] - 2.0, limits[:, :6], knots=slice(0, 6)), [1, 2, 3, 4, 5]
+    if kind == "values of knots":
+        return FunctionConstraint(lambda x, c: x - c, knot_values={"c": limits}), [1, 2, 3, 4, 5, 6]
+    if kind == "numbers of knots":
+        return FunctionConstraint(lambda x, k: x - limits[0, k]), [1, 2, 3, 4, 5, 6]
+    return FunctionConstraint(lambda x, u, c: x * u - c, of="xu", knot_values={"c": limits}), [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("kind", ["bounds at 0 to N - 1", "values of knots", "numbers of knots", "states and controls"])
+def test_numbers_are_those_of_the_stages_knot(kind: str) -> None:
+    """Rows by hand: of the knot at which the stage ends, and where controls count of that at which it begins."""
+    row, knots = drawn_limits(kind)
+    draws = torch.Generator().manual_seed(4)
+    limits = torch.rand(1, 7, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    X, U = (torch.randn(1, size, m, generator=draws, dtype=torch.float64) for size, m in ((7, 2), (6, 1)))
+    model = FunctionDynamics(swing, 2, 1, 0.3, "midpoint")
+    cost = QuadraticCost(Q=[1.0, 0.0], R=[0.01], Qf=[10.0, 10.0])
+    problem = Problem(model, cost, [BetweenKnots(row, 2)], torch.zeros(1, 2, dtype=torch.float64), 6)
+    found = problem.constraints[0].value(X, U)
+    stages = [k if kind == "states and controls" else k - 1 for k in knots]
+    for place, (stage, knot) in enumerate(zip(stages, knots, strict=True)):
+        for i in (1, 2):
+            x, u, h = X[0, stage], U[0, stage], 0.1 * i
+            x = x + h * swing(x + 0.5 * h * swing(x, u), u)
+            due = x * u - limits[0, knot] if kind == "states and controls" else x - limits[0, knot]
+            torch.testing.assert_close(found[0, place].chunk(2)[i - 1][:2], due)
+    assert found.shape[1] == len(stages)
+
+
 @pytest.mark.parametrize(
     ("within", "word"),
     [
@@ -123,6 +161,7 @@ def test_stages_are_those_that_end_at_the_knots() -> None:
         (BetweenKnots(Spheres([[0.0, 0.0]], [0.1])), "constraint"),
         (BetweenKnots(FunctionConstraint(lambda x: x[..., :1], sense="equality")), "constraint"),
         (BetweenKnots(3), "constraint"),
+        (BetweenKnots(BetweenKnots(RING[0])), "anyway"),
     ],
 )
 def test_wrong_use_is_told(within: BetweenKnots, word: str) -> None:
@@ -137,3 +176,31 @@ def test_the_model_is_the_problems() -> None:
     assert isinstance(between_knots, BetweenKnots) and between_knots.model.dt == 0.2
     with pytest.raises(InputError, match="integrates a field"):
         replace(problem, dynamics=replace(POINT, function=lambda x, u: x, integrator="none"))
+
+
+@compiled
+def test_tightened_rows_leave_nothing_between_their_points() -> None:
+    problem, X0 = half_a_turn(*(BetweenKnots(row) for row in RING))
+    for stated in (problem, replace(problem, time=FreeTime(0.5, 3.0, weight=0.1))):
+        closer, solution = stated, torchgco.solve(stated, solver="interior_point", X0=X0, verbose=False)
+        within = lambda found, stated=stated: float(
+            torchgco.judge(stated, found.U, times=found.t if stated.time else None).violation_between
+        )
+        cost, left = float(solution.cost), []
+        for _ in range(2):
+            left.append(within(solution))
+            closer = torchgco.tightened(closer, solution)
+            solution = torchgco.solve(closer, solver="interior_point", warm=solution, X0=solution.X, verbose=False)
+            assert solution.statuses[0].name == "CONVERGED"
+        assert left[0] > 1e-3 and left[1] < 0.2 * left[0] and within(solution) < 1e-5
+        assert cost <= float(solution.cost) < 1.01 * cost
+
+
+def test_what_cannot_be_tightened_is_told() -> None:
+    problem, _ = half_a_turn()
+    solution = torchgco.solve(problem, solver="hold", verbose=False)
+    with pytest.raises(InputError, match="BetweenKnots"):
+        torchgco.tightened(problem, solution)
+    other, _ = half_a_turn(BetweenKnots(RING[0]), N=6)
+    with pytest.raises(InputError, match=r"solution\.U"):
+        torchgco.tightened(other, solution)

@@ -145,14 +145,54 @@ def test_a_step_without_its_stage_is_refused() -> None:
             call(problem.x0, problem.x0[:, :2])
 
 
-def test_operations_that_differ_between_stages_are_named() -> None:
+@compiled
+def test_operations_may_differ_between_stages() -> None:
     def step(x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         if isinstance(k, int):
-            return x.sin() if k < 5 else x.cos()
-        return torch.stack([x[..., i, :].sin() if j < 5 else x[..., i, :].cos() for i, j in enumerate(k.tolist())], -2)
+            return x.sin() + 0.1 * u if k < 5 else x.cos() + 0.1 * u
+        rows = (x[..., i, :].sin() if j < 5 else x[..., i, :].cos() for i, j in enumerate(k.tolist()))
+        return torch.stack(list(rows), -2) + 0.1 * u
 
     model = FunctionDynamics(step, 2, 2, 0.1, "none")
     cost = FunctionCost(lambda x, u: u.square().sum(-1) + x.square().sum(-1))
     problem = Problem(model, cost, [], torch.ones(1, 2, dtype=D), 10)
-    with pytest.warns(EagerWarning, match="dynamics.step: expected the same operations at every knot"):
-        assert engine_of(problem) is None
+    assert engine_of(problem) is not None
+    found = [torchgco.solve(problem, solver=solver) for solver in ("interior_point", "al_ilqr")]
+    assert [one.statuses for one in found] == [[Status.CONVERGED]] * 2
+    torch.testing.assert_close(found[0].cost, found[1].cost, rtol=1e-6, atol=0.0)
+
+
+@compiled
+def test_networks_and_captured_numbers_of_some_stages() -> None:
+    """Numbers that all problems share lie behind those of the forms, and may change."""
+    net = (
+        torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 2))
+        .double()
+        .requires_grad_(False)
+    )
+    with torch.no_grad():
+        for p, weights in enumerate(net.parameters()):
+            weights.copy_(torch.randn(weights.shape, generator=torch.Generator().manual_seed(p), dtype=D))
+    gain = torch.tensor([0.3, -0.2], dtype=D)
+
+    def step(x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        learned = net(torch.cat((x, u), -1))
+        kinds = x + 0.1 * learned, (x + gain * u).sin(), x.cos() + 0.1 * learned * gain
+        if isinstance(k, int):
+            return kinds[k % 3]
+        return torch.stack([kinds[j % 3][..., i, :] for i, j in enumerate(k.tolist())], -2)
+
+    cost = FunctionCost(lambda x, u: u.square().sum(-1) + x.square().sum(-1))
+    problem = Problem(
+        FunctionDynamics(step, 2, 2, 0.1, "none"), cost, [], torch.tensor([[1.0, 0.5], [0.2, -1.0]]).double(), 7
+    )
+    U = torch.randn(2, 7, 2, generator=torch.Generator().manual_seed(9), dtype=D)
+    for _ in range(2):
+        now = kernels.current(problem)
+        assert engine_of(now) is not None
+        torch.testing.assert_close(
+            open_loop(now, U), rollout.open_loop(now.dynamics, now.x0, U), rtol=1e-13, atol=1e-13
+        )
+        found = [torchgco.solve(problem, solver=solver) for solver in ("interior_point", "al_ilqr")]
+        torch.testing.assert_close(found[0].cost, found[1].cost, rtol=1e-6, atol=0.0)
+        gain += 0.4

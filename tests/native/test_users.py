@@ -210,14 +210,6 @@ class Jerky(Smooth):
         H[:, :-1, n, n + 1 :] += slope
 
 
-class FirstIsFree(Smooth):
-    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        value = super().stage(x, u, k)
-        if isinstance(k, int):
-            return value if k > 0 else 0.0 * value
-        return torch.cat((torch.zeros_like(value[:, :1]), value[:, 1:]), dim=1)
-
-
 class Beside(Smooth):
     """It reads the stage before only where that is in a window that no point shows."""
 
@@ -249,7 +241,6 @@ def with_rows(row: Constraint) -> Problem:
     [
         (lambda: with_cost(Looks()), r"cost.stage \(Looks\): expected a function that can be traced"),
         (lambda: with_cost(Jerky()), r"cost.total \(Jerky\)"),
-        (lambda: with_cost(FirstIsFree()), r"cost.stage \(FirstIsFree\): expected the same operations at every knot"),
         (lambda: with_cost(Beside()), r"cost.stage \(Beside\): expected rows that read their own knot alone"),
         (lambda: with_rows(Jerk()), r"constraints\[0\] \(Jerk\): expected rows that read their own knot alone"),
         (lambda: with_rows(Tube(torch.zeros(13, 2), torch.ones(5), slice(1, 1))), "at least one knot"),

@@ -48,6 +48,16 @@ class Smooth(Cost):
         return 10.0 * torch.log1p((x - 0.5).square().sum(-1))
 
 
+class FirstIsFree(Smooth):
+    """Other operations at the first stage."""
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        value = super().stage(x, u, k)
+        if isinstance(k, int):
+            return value if k > 0 else 0.0 * value
+        return torch.cat((torch.zeros_like(value[:, :1]), value[:, 1:]), dim=1)
+
+
 @dataclass(frozen=True)
 class Each(Cost):
     """A target and a weight per problem, and a shared weight."""
@@ -284,6 +294,23 @@ def with_stages(function: Callable[..., Tensor] = by_stage, rows: slice = slice(
     return Problem(model, cost, [bounds, discs], base.x0[rows], N)
 
 
+def with_models_by_stage() -> Problem:
+    """Three kinds of steps, of which one holds numbers of its problem and its stage."""
+    drag = 0.2 + 0.1 * normal(B, 4, seed=40).abs()
+
+    def step(x: Tensor, u: Tensor, k: int | Tensor, drag: Tensor, gust: Tensor) -> Tensor:
+        push = 0.1 * torch.cat((u, u[..., :1] * x[..., :1], u[..., 1:].sin()), dim=-1)
+        kinds = [x + push, (x * (1.0 - 0.1 * drag) + push * gust).tanh(), x.sin() + push.square()]
+        if isinstance(k, int):
+            return kinds[k % 3]
+        return torch.stack([kinds[j % 3][..., i, :] for i, j in enumerate(k.tolist())], dim=-2)
+
+    gusts = {"gust": 1.0 + normal(1, N, 4, seed=41)}
+    base = user_problem(B, N)
+    model = FunctionDynamics(step, n=4, m=2, dt=0.1, integrator="none", values={"drag": drag}, knot_values=gusts)
+    return Problem(model, FirstIsFree(), base.constraints, base.x0, N)
+
+
 def with_bounds_by_knot() -> Problem:
     base = user_problem(B, N)
     lower = -0.2 - normal(B, N, 2, seed=35).abs()
@@ -324,6 +351,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "constraints": with_constraints,
     "first step": first_step,
     "dynamics by stage": with_stages,
+    "models by stage": with_models_by_stage,
     "bounds by knot": with_bounds_by_knot,
     "norms and cones": with_norms,
 }

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.patches import Circle, Polygon
 from PIL import Image
 
 import torchgco
-from torchgco import Body, Boxes, ControlBounds, Ellipsoids, FunctionDynamics, Problem, QuadraticCost, Spheres
+from torchgco import Body, ControlBounds, Ellipsoids, FunctionDynamics, Problem, QuadraticCost, Spheres
 from torchgco.base.errors import InputError
 
 POINT = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4", position=slice(0, 2))
@@ -19,18 +21,18 @@ X0 = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0]]).double()
 MOVING = Spheres([[1.0, -1.0]], [0.2], 0.1, [[0.0, 1.0]])
 
 
-def problem(*parts: object, N: int = 20) -> Problem:
+def problem(*parts: object, N: int = 5) -> Problem:
     return Problem(POINT, COST, [*parts, ControlBounds(-9.0, 9.0)], X0, N)
 
 
-def colours(path: Path) -> list[int]:
-    """How many pixels of each picture of a file are dark grey, as an obstacle's are, to the nearest ten."""
+def changes_in(path: Path) -> list[int]:
+    """By how much each picture of a file differs from the one before."""
     pictures = []
     with Image.open(path) as film:
         for i in range(film.n_frames):
             film.seek(i)
             pictures.append(np.asarray(film.convert("RGB")).astype(int))
-    return [int(np.abs(a - b).sum()) for a, b in zip(pictures, pictures[1:], strict=False)]
+    return [int(np.abs(a - b).sum()) for a, b in pairwise(pictures)]
 
 
 @pytest.mark.parametrize("others", [(), (Ellipsoids([[0.5, 1.0]], [[0.1, 0.2]], 0.1, [0.3], [[0.0, -0.5]]),)])
@@ -39,21 +41,29 @@ def test_a_film_shows_what_moves(others: tuple[object, ...], tmp_path: Path) -> 
     solution = torchgco.solve(stated, verbose=False)
     film = torchgco.animate(stated, solution, [0, 1])
     film.save(tmp_path / "way.gif", writer="pillow", dpi=50)
-    changes = colours(tmp_path / "way.gif")
-    assert len(changes) == 40 and min(changes) > 0
-    figure, places = film._fig, []
-    for t in (0.0, 1.0, 2.0):
-        film._func(t)
-        (ball,) = [p for p in figure.axes[0].patches if p.get_zorder() == 1.0]
-        places.append(0.5 * (ball.get_path().vertices.max(0) + ball.get_path().vertices.min(0)))
-    np.testing.assert_allclose(np.array(places), [[1.0, -1.0], [1.0, 0.0], [1.0, 1.0]], atol=0.02)
+    changes = changes_in(tmp_path / "way.gif")
+    assert len(changes) == 10 and min(changes) > 0
+
+
+def test_obstacles_and_vehicles_are_where_they_are_then() -> None:
+    stated = problem(MOVING)
+    solution = torchgco.solve(stated, verbose=False)
+    film = torchgco.animate(stated, solution)
+    for t in (0.0, 0.25, 0.5):
+        drawn = film.at(t)
+        corners = [shape.get_path().vertices for shape in drawn if isinstance(shape, Polygon)]
+        np.testing.assert_allclose([0.5 * (c.max(0) + c.min(0)) for c in corners], [[1.0, -1.0 + t]], atol=0.02)
+        (vehicle,) = [shape for shape in drawn if isinstance(shape, Circle)]
+        k = t / 0.1
+        way = 0.5 * (solution.X[0, int(k), :2] + solution.X[0, int(k + 0.5), :2])
+        np.testing.assert_allclose(vehicle.center, way, atol=1e-9)
 
 
 def test_a_notebook_plays_it_with_a_body() -> None:
     body = Body.covering([-0.2, -0.1], [0.2, 0.1], [2, 1])
     model = torchgco.Unicycle(dt=0.1)
     cost = QuadraticCost([0.0] * 4, [0.1] * 2, [100.0, 100.0, 0.0, 1.0], x_ref=[1.0, 0.0, 0.0, 0.0])
-    boxes = Boxes([[0.5, 0.9]], [[0.2, 0.1]], body, angles=[0.3])
+    boxes = Spheres([[0.5, 0.9]], [0.2], body)
     stated = Problem(model, cost, [boxes], torch.zeros(1, 4, dtype=torch.float64), 5)
     film = torchgco.animate(stated, torchgco.solve(stated, verbose=False))
     assert "<script" in film._repr_html_()
@@ -62,13 +72,12 @@ def test_a_notebook_plays_it_with_a_body() -> None:
 def test_wrong_calls_are_told() -> None:
     stated = problem(MOVING)
     solution = torchgco.solve(stated, solver="hold", verbose=False)
-    film = torchgco.animate(stated, solution)
-    film._draw_was_started = True
     with pytest.raises(InputError, match=r"b: expected the place"):
         torchgco.animate(stated, solution, 2)
-    apart = Problem(POINT, COST, [Spheres([[[1.0, 1.0]], [[1.0, 2.0]]], [0.2], 0.1)], X0, 20)
+    apart = Problem(POINT, COST, [Spheres([[[1.0, 1.0]], [[1.0, 2.0]]], [0.2], 0.1)], X0, 5)
     with pytest.raises(InputError, match="same obstacles"):
         torchgco.animate(apart, torchgco.solve(apart, solver="hold", verbose=False), [0, 1])
-    nowhere = Problem(FunctionDynamics(lambda x, u: u, 2, 2, 0.1), QuadraticCost([1.0] * 2, [1.0] * 2, [1.0] * 2), [], X0[:, :2], 5)
+    still = FunctionDynamics(lambda x, u: u, 2, 2, 0.1)
+    nowhere = Problem(still, QuadraticCost([1.0] * 2, [1.0] * 2, [1.0] * 2), [], X0[:, :2], 5)
     with pytest.raises(InputError, match="position"):
         torchgco.animate(nowhere, torchgco.solve(nowhere, solver="hold", verbose=False))

@@ -75,6 +75,19 @@ def test_an_npz_file_and_a_csv_file_of_the_same_controls_are_judged_alike(
     assert one["cost"].tolist() == verdict.cost.tolist()
 
 
+def test_seconds_may_stand_in_one_row_of_a_layout(path: Path, U: np.ndarray, tmp_path: Path) -> None:
+    rows = table_of(U, seconds=np.nan).sample(frac=1, random_state=0)
+    rows.loc[(rows["k"] == 0) & (rows["layout"] < 2), "seconds"] = [0.1, 0.1]
+    rows.to_csv(tmp_path / "mine.csv", index=False)
+    assert judge_files(path, [tmp_path / "mine.csv"])["seconds"].fillna(-1).tolist() == [0.1, 0.1, -1]
+
+
+@pytest.mark.parametrize("word", ["study.layouts=1", "solver=gco", "seed=1", "scenario.path=other.npz", "+map=x"])
+def test_words_without_an_effect_are_refused(word: str, path: Path) -> None:
+    with pytest.raises(InputError, match="words that name a model or change it"):
+        Scene.read(path, [word])
+
+
 def test_a_csv_file_of_several_solvers(path: Path, U: np.ndarray, tmp_path: Path) -> None:
     rows = pd.concat([table_of(U, solver="my solver, 2"), table_of(0 * U, solver="007")])
     rows.to_csv(tmp_path / "both.csv", index=False)
@@ -202,6 +215,11 @@ WRONG: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "far layouts": ("x.csv", lambda file: file.write_text("layout,k,u1,u2\n9,0,1,1\n"), "got layout 9"),
     "beyond": ("x.csv", lambda file: file.write_text(f"layout,k,u1,u2\n0,{N},1,1\n"), "k from 0 to 199, got 200"),
     "repeated": ("x.csv", lambda file: file.write_text("layout,k,u1,u2\n0,3,1,1\n0,3,1,1\n"), "two for layout 0, k 3"),
+    "unlike seconds": (
+        "x.csv",
+        lambda file: file.write_text("layout,k,u1,u2,seconds\n1,0,1,1,2\n1,1,1,1,3\n"),
+        "2 and 3 for layout 1",
+    ),
     "packed": ("x.csv", lambda file: file.write_bytes(b"\x1f\x8b" + bytes(50)), "CONTROLS: expected"),
 }
 

@@ -58,7 +58,8 @@ def lanes(B: int, seed: int, weight: float, **time: float) -> Problem:
     return Problem(model, cost, [moving, *bounds], torch.zeros(B, 4, dtype=D), 50, goal, time=free)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 5])
 def test_who_may_choose_the_time_takes_the_gap_that_is_cheapest(seed: int) -> None:
     problem = lanes(4, seed, 1.0)
     solution, before = solve(problem, verbose=False), solve(problem, solver=WITHOUT, verbose=False)

@@ -128,6 +128,16 @@ def test_requiring_the_goal_costs_no_more_than_stating_it(kind: str, walls: bool
     assert_same_bits(torchgco.solve(required.take(one), ids=one, verbose=False), held.take([2]))
 
 
+def test_a_goal_that_binds_is_released_where_the_terminal_cost_draws_into_it() -> None:
+    """From a heading drawn so, the required goal's border holds the end of a way of 21.4, and 12.1 is a way's cost."""
+    one = torch.tensor([56])
+    stated, required = (
+        turning("unicycle", headings(64, 77), required=required).take(one) for required in (False, True)
+    )
+    free, held = (torchgco.solve(problem, ids=one, verbose=False) for problem in (stated, required))
+    assert bool(judge(required, held.U).reached.all()) and float(held.cost) <= 1.001 * float(free.cost) < 12.2
+
+
 def test_nothing_is_released_that_binds_or_was_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     released: list[int] = []
     usual = Problem.releasing_goal

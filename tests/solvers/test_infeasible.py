@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pytest
 import torch
+from scipy.optimize import linprog
 from torch import Tensor
 
-from torchgco import ControlBounds, FunctionConstraint, FunctionDynamics, Problem, QuadraticCost, StateBounds, Status
+import torchgco
+from tests.slow import mostly
+from torchgco import (
+    ControlBounds,
+    FunctionConstraint,
+    FunctionDynamics,
+    Gates,
+    Goal,
+    Problem,
+    QuadraticCost,
+    StateBounds,
+    Status,
+)
 from torchgco.constraints.base import Constraint
+from torchgco.kernels import open_loop
 from torchgco.native.compiler import find_compiler
-from torchgco.solvers.infeasible import left_to_close
+from torchgco.solvers.infeasible import contradicts, left_to_close
 from torchgco.solvers.interior import InteriorPoint
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -63,3 +80,61 @@ def test_feasible_problems_that_end_early_are_not_infeasible() -> None:
     assert found.statuses == [Status.CONVERGED] * 2
     share = left_to_close(given, X.X, X.U)
     assert bool((share > 0.9).all() and (share < 1 + 1e-9).all())
+
+
+def courses(seed: int, B: int = 12, G: int = 2, stages: int = 18) -> Problem:
+    """Square gates at given knots, and a goal that is required, for points with bounds on their acceleration."""
+    draws = torch.Generator().manual_seed(seed)
+    x0 = torch.randn(B, 4, generator=draws, dtype=D) * torch.tensor([0.2, 0.2, 0.5, 0.5], dtype=D)
+    steps = torch.rand(B, G, 2, generator=draws, dtype=D) * 1.4 - 0.5
+    centers, normals = x0[:, None, :2] + steps.cumsum(1), torch.randn(B, G, 2, generator=draws, dtype=D)
+    knots = [[1 + 2 * k for k in torch.randperm(7, generator=draws)[:G].sort().values.tolist()] for _ in range(B)]
+    goal = centers[:, -1] + 0.3 * torch.randn(B, 2, generator=draws, dtype=D)
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4", position=slice(0, 2))
+    gates = Gates(centers, normals=normals, half_widths=0.3, knots=knots)
+    cost = QuadraticCost([0.0] * 4, [0.1] * 2, [100.0] * 4, x_ref=torch.cat((goal, 0 * goal), -1).unsqueeze(1))
+    return Problem(model, cost, [gates, ControlBounds(-5.0, 5.0)], x0, stages, goal=Goal(goal, 0.2, required=True))
+
+
+def least_excess(problem: Problem, b: int) -> float:
+    """By how much some row of the gates, or of 64 lines around the goal, has to be violated: a linear programme."""
+    gates: Any = problem.constraints[0]
+    n, dt, count = problem.N, problem.dynamics.dt, 2 * problem.N
+    late = (torch.arange(1, n + 1).unsqueeze(-1) - torch.arange(n) - 0.5).clamp(min=0.0).double() * dt**2  # (k, j)
+    drift = problem.x0[b, :2] + dt * torch.arange(1, n + 1).double().unsqueeze(-1) * problem.x0[b, 2:]
+    slopes, limits = gates.slopes[b], gates.limits[b]  # (N, p, 2), (N, p)
+    angles = torch.arange(64).double() * torch.pi / 32
+    around = torch.stack((angles.cos(), angles.sin()), -1)
+    ends = around @ problem.goal.position[b] + problem.goal.radius[b]
+    of_gates = (slopes.unsqueeze(-1) * late[:, None, None]).reshape(-1, count)
+    A = torch.cat((of_gates, (around.unsqueeze(-1) * late[-1]).reshape(-1, count)))
+    b_ub = torch.cat(((limits - (slopes @ drift.unsqueeze(-1))[..., 0]).flatten(), ends - around @ drift[-1]))
+    A = torch.cat((A, -torch.ones(len(A), 1, dtype=D)), -1)
+    cost = np.append(np.zeros(count), 1.0)
+    found = linprog(cost, A.numpy(), b_ub.numpy(), bounds=[(-5.0, 5.0)] * count + [(None, None)])
+    return float(found.x[-1])
+
+
+@pytest.mark.parametrize("seed", mostly(range(6), *range(1, 6)))
+def test_gates_that_contradict_each_other_are_infeasible(seed: int) -> None:
+    problem = courses(seed)
+    excess = torch.tensor([least_excess(problem, b) for b in range(problem.B)])
+    found = torchgco.solve(problem, verbose=False)
+    said = found.status == Status.INFEASIBLE
+    assert int((excess > 2e-3).sum()) >= 3 and int((excess < 0).sum()) >= 3
+    assert bool(said[excess > 2e-3].all()), (found.status[~said & (excess > 2e-3)], excess)
+    assert not bool(said[excess < 0].any())
+
+
+def test_no_contradiction_is_proved_where_there_is_none() -> None:
+    """At drawn trajectories, of problems that are feasible by linear programmes; at the least violated, it is."""
+    problem = courses(7, B=24)
+    excess = torch.tensor([least_excess(problem, b) for b in range(24)])
+    draws = torch.Generator().manual_seed(7)
+    for size in (0.0, 1.0, 5.0, 30.0):
+        U = size * torch.randn(24, problem.N, 2, generator=draws, dtype=D)
+        assert not bool(contradicts(problem, open_loop(problem, U), U, 1e-3)[excess < 0].any())
+    U = torchgco.solve(problem, verbose=False).U
+    proved = contradicts(problem, open_loop(problem, U), U, 1e-3)
+    assert int((excess < 0).sum()) >= 6 and not bool(proved[excess < 0].any())
+    assert int(proved.sum()) >= 0.5 * int((excess > 2e-3).sum())

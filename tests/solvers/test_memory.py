@@ -3,14 +3,27 @@
 import io
 import subprocess
 import sys
+import warnings
 
 import pytest
 import torch
 
 from tests.engines import engine_of
 from tests.problems import planar_batch, quadrotor_batch
-from torchgco import InputError
+from torchgco import (
+    Constraint,
+    ControlBounds,
+    FreeTime,
+    FunctionDynamics,
+    InputError,
+    Integral,
+    Link,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+)
 from torchgco.base.memory import free_memory
+from torchgco.native.compiler import find_compiler
 from torchgco.solvers.memory import (
     CPU_LIMIT,
     element_bytes,
@@ -73,3 +86,19 @@ def test_the_estimate_is_that_of_one_problem() -> None:
     rows = sum(c.value(X, U)[0].numel() for c in problem.constraints)
     assert engine_of(problem) is not None
     assert element_bytes(problem) == least_bytes(10, 6, 2, rows)
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize(
+    "row", [Link(components=[2]), Integral(lambda x, u: u.square().sum(-1), most=9.0), RateBounds(-1.0, 1.0)]
+)
+@pytest.mark.parametrize("free", [False, True])
+def test_rows_of_several_knots_are_compiled_in_the_solvers_form(row: Constraint, free: bool) -> None:
+    """A warning said that PyTorch's kernels solve them, many times slower."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4")
+    cost = QuadraticCost([1.0] * 4, [0.1] * 2, [1.0] * 4)
+    time = FreeTime(0.5, 2.0, weight=1.0) if free else None
+    problem = Problem(model, cost, [row, ControlBounds(-2.0, 2.0)], [[0.0] * 4], 10, time=time)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert 10 * 8 * 10 * 4 < element_bytes(problem) < 1e5

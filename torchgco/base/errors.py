@@ -76,7 +76,7 @@ class HorizonWarning(UserWarning):
 
 
 class StepWarning(UserWarning):
-    """A model's time step is too long: half of it gives other states, or another cost."""
+    """A model's time step is too long: half of it gives other states, or a cost that is off by over 1 %."""
 
 
 class RefusalWarning(UserWarning):

@@ -30,7 +30,7 @@ class Status(Explained):
     MAX_ITERATIONS = 2, ("The solve ended, by an iteration limit or its tolerance, before the trajectory was "
         "stationary; try a higher limit or a smaller tolerance.")  # fmt: skip
     LINE_SEARCH_FAILED = 3, ("No step length gave an acceptable decrease before the trajectory was stationary; the "
-        "problem may be badly scaled.")  # fmt: skip
+        "problem may be badly scaled, or its constraints contradict each other.")  # fmt: skip
     NOT_POSITIVE_DEFINITE = 4, "The regularised control Hessian stayed indefinite up to the largest regularisation."
     NON_FINITE = 5, "A state, cost or derivative became NaN or infinite."
     INFEASIBLE = 6, ("No iterate met the constraints, and nothing that was tried lowers the violation further; the "

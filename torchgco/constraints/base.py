@@ -54,6 +54,8 @@ class Constraint(PerElement):
     says_where: ClassVar[bool] = False  # whether it says where to be, not how fast
     in_place: ClassVar[bool] = False  # whether it finds its states and controls where others follow them
     joins_knots: ClassVar[bool] = False  # whether its rows are of two knots
+    on_its_way: ClassVar[bool] = False  # whether rows are kept between knots, too
+    tightened: ClassVar[Any] = None  # a method, where rows within stages can move to where they are violated
 
     @property
     def bare(self) -> Constraint:
@@ -210,6 +212,7 @@ class Distance(Constraint):
     P places of a state, points (B, K, P, d) or vectors between two of them, keep distances from M surfaces each.
     """
 
+    on_its_way: ClassVar[bool] = True
     contact_depths: Any  # (B, P M): how deep beneath the full surfaces bodies touch, m
 
     def places(self, X: Tensor) -> Tensor:

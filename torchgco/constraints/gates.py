@@ -93,6 +93,7 @@ class GateBalls(NormBounds):
     per_element: ClassVar[tuple[str, ...]] = ()
     name: ClassVar[str] = "gates"
     label: ClassVar[str] = "gates"
+    on_its_way: ClassVar[bool] = True
     in_metres: ClassVar[bool] = True  # type: ignore[misc]
     says_where: ClassVar[bool] = True
 
@@ -139,6 +140,7 @@ class GateSquares(Vectors):
     batched: ClassVar[tuple[str, ...]] = ("centers", "axes", "half_widths", "places", "slopes", "limits")
     of: ClassVar[str] = "x"
     name: ClassVar[str] = "gates"
+    on_its_way: ClassVar[bool] = True
     in_metres: ClassVar[bool] = True  # type: ignore[misc]
     says_where: ClassVar[bool] = True
 

@@ -118,6 +118,12 @@ class Link(Constraint):
         places = first + torch.arange(len(self.components), device=self.components.device), self.components
         return CarriedRows(self.function, self.sense, self.knots, name=self.name, values=self.values, places=places)
 
+    def at_once(self, later: Link) -> Constraint:
+        """The same rows of a state and a control that is the later state, whose components `later` has."""
+        assert self.function is not None
+        places = self.components, later.components
+        return RowsAtOnce(self.function, self.sense, of="xu", name=self.name, values=self.values, places=places)
+
 
 @dataclass(frozen=True)
 class CarriedRows(FunctionConstraint):
@@ -134,3 +140,14 @@ class CarriedRows(FunctionConstraint):
 
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
         return self
+
+
+@dataclass(frozen=True)
+class RowsAtOnce(FunctionConstraint):
+    """Rows of some components of a state, and of a control that is a state, too."""
+
+    places: tuple[Tensor, ...] = ()  # of both which components, (r,) int64
+
+    def rows_at(self, k: Tensor | int, *arguments: Tensor) -> Tensor:
+        pairs = zip(arguments, self.places, strict=True)
+        return self.values.call(self.function, *(z[..., components] for z, components in pairs))

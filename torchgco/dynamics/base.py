@@ -14,7 +14,7 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError
 from torchgco.base.options import Checked, Count, Natural, Seconds
 from torchgco.base.roots import root
-from torchgco.base.shapes import Dimensions
+from torchgco.base.shapes import Dimensions, repeated
 from torchgco.base.tree import PerElement, is_users, passed_on
 from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
 from torchgco.dynamics.integrators import INTEGRATORS, Integrator
@@ -87,6 +87,10 @@ class Dynamics(PerElement, Checked):
         """
         return self
 
+    def at_rest(self, x0: Tensor, N: int) -> Tensor:
+        """States (B, N+1, n) that stay at the start x0 (B, n), by which the scale of a cost is told."""
+        return repeated(x0, N + 1)
+
     def bind(self, dims: Dimensions) -> Self:
         """The model checked and shaped for one problem; called once, by Problem."""
         return self
@@ -114,6 +118,10 @@ class WrappedDynamics(Dynamics):
         "model", "n", "m", "dt", "position", "integrator", "stretches"
     )
     calls_function = property(lambda self: is_users(self.model))
+
+    def at_rest(self, x0: Tensor, N: int) -> Tensor:
+        n = self.model.n
+        return torch.cat((self.model.at_rest(x0[:, :n], N), repeated(x0[:, n:], N + 1)), dim=-1)
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         rates = self.model.field(x[..., : self.model.n], u)

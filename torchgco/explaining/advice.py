@@ -9,6 +9,7 @@ from typing import Any
 from torchgco.base.status import Status
 
 FITS = (Status.CONVERGED, Status.FEASIBLE)
+GAVE_UP = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE)  # it may be infeasible
 LIMITS = ("max_outer_iterations", "max_iterations", "iterations", "rounds", "starts", "budget")  # options of solvers
 DEEP = 2  # parts of a solver within each other in which limits are looked for
 MANY = 3  # limits that are named
@@ -179,7 +180,10 @@ def advice(facts: Facts) -> list[str]:
         limits = [f"{name}={value}" for name, value in limits_of(facts.solver)][:MANY]
         row = "the row named above" if facts.named else "one constraint after the other"
         limited = f" ({', '.join(limits)})" if limits else ""
-        sentences.append(BY_STATUS[facts.status].format(limits=limited, row=row, longer=facts.longer))
+        reasons = [Status.INFEASIBLE] if facts.named and facts.status in GAVE_UP else []
+        sentences += [
+            BY_STATUS[s].format(limits=limited, row=row, longer=facts.longer) for s in (*reasons, facts.status)
+        ]
     if tells_to_record(facts):
         sentences.append("torchgco.solve(..., record=True), after which explain tells what each pass did.")
     return sentences

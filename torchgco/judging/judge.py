@@ -19,6 +19,7 @@ from torchgco.constraints.base import ADMITTED, Constraint, Distance
 from torchgco.constraints.gates import has_gates
 from torchgco.judging.gates import passages
 from torchgco.judging.steps import StepErrors, step_errors
+from torchgco.judging.within import path_rows, violation_between
 from torchgco.problem.alone import row_by_row
 from torchgco.problem.between import Paths, paths
 from torchgco.problem.goal import Goal
@@ -50,6 +51,8 @@ class Verdict:
     gates_passed: Tensor  # int64: how many gates are passed in the order of `Gates`, at or between any knots
     step_error: Tensor  # whether dt is short enough: see `StepErrors`; NaN without a known field
     step_cost: Tensor
+    # largest violation within stages of inequalities of the state, which hold at the knots: see `violation_between`
+    violation_between: Tensor
 
     def success(self, best_cost: Tensor) -> Tensor:
         """Whether reached, and within 5 % of the best known cost (B,), (B,) bool.
@@ -206,7 +209,8 @@ def _verdict(
     if problem.dynamics.position is None and not any(isinstance(row, Distance) for row in problem.constraints):
         clearance_knots = clearance = torch.full_like(cost, torch.nan)
     of_goal, of_steps = (goal_distance, feasible, reached), (errors.step_error, errors.step_cost)
-    return Verdict(cost, violation, clearance_knots, clearance, *of_goal, clear_95, passed, *of_steps)
+    between_knots = violation_between(problem, X, U)
+    return Verdict(cost, violation, clearance_knots, clearance, *of_goal, clear_95, passed, *of_steps, between_knots)
 
 
 def _worst_within(problem: Problem, constraint: Constraint, X: Tensor, U: Tensor) -> Tensor:
@@ -254,27 +258,28 @@ def frame_columns(verdict: Verdict) -> dict[str, Any]:
     return {name: getattr(verdict, name).cpu().numpy() for name in names}
 
 
-def gates_passed(problem: Problem, verdict: Verdict) -> dict[str, Any]:
-    """The column `gates_passed`; none where there are no gates."""
-    return {"gates_passed": verdict.gates_passed.cpu().numpy()} if has_gates(problem) else {}
+def more_columns(problem: Problem, verdict: Verdict) -> dict[str, Any]:
+    """`gates_passed` where there are gates, `violation_between` where rows may be violated within stages alone."""
+    names = ["gates_passed"] if has_gates(problem) else []
+    names += ["violation_between"] if path_rows(problem) else []
+    return {name: getattr(verdict, name).cpu().numpy() for name in names}
 
 
 def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Tensor | None = None) -> dict[str, Any]:
     """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
 
-    `clearance` (m) where the problem has obstacles, `reached` where it has a goal, `gates_passed` where it has gates; a
-    problem of another precision is judged in float64; `start` and `times` as in `judge`.
+    `clearance` (m) where the problem has obstacles, `reached` where it has a goal, and `more_columns`; a problem of
+    another precision is judged in float64; `start` and `times` as in `judge`.
 
     Raises:
         InputError: as `judge`.
     """
     problem = current_problem(problem)
-    if problem.dynamics.position is None:
-        return {}
     names = ["clearance"] if any(isinstance(c, Distance) for c in problem.constraints) else []
     names += ["reached"] if problem.goal is not None else []
-    if not names and not has_gates(problem):
+    names = names if problem.dynamics.position is not None else []
+    if not names and not has_gates(problem) and not path_rows(problem):
         return {}
     verdict = judge(problem, U, start=start, times=times)
     values = {name: getattr(verdict, name).cpu().numpy() for name in names}
-    return values | gates_passed(problem, verdict)
+    return values | more_columns(problem, verdict)

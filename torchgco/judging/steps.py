@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.shapes import computing_on
+from torchgco.base.tree import is_users
 from torchgco.costs.base import Cost
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.problem.horizons import at_rest_after, within_horizons
@@ -28,11 +29,9 @@ LARGE_ERROR = 0.1  # step errors above this are large
 # most, which controls that change at every stage come close to without a stiff model.
 LARGE_OF_FIRST = 0.5
 LARGE_COST = 0.01  # costs that are off by more than this share are, and the step costs by which they show
-# A method of order p changes the cost by c / N^p where nothing changes faster than within the whole duration: up to so
-# much is no sign of too long a step. For Euler steps of models that aren't stiff c is 0.3 to 2.2.
+# Of torchgco's own models, whose Euler steps were published with them. A method of order p changes the cost by c / N^p
+# where nothing changes faster than within the whole duration: for these c is 0.3 to 2.2.
 COARSE = 2.5
-# Step errors of order 1 up to which no step cost is doubted: whoever takes Euler steps takes errors that add up.
-HARMLESS_OF_FIRST = 0.05
 LEAST_RANGE = 1e-3  # of a state's largest size: its range counts as no less
 LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 ELASTIC = 100.0  # by how many per cent no cost changes where a state changes by one per cent of its range
@@ -51,6 +50,7 @@ class StepErrors:
     state: Tensor  # int64: the state of `step_error`
     stage: Tensor  # int64: its stage
     large: Tensor  # bool: one of them is, and dt too long for the model
+    of_cost: Tensor  # bool: of Euler steps, the cost's alone
 
     def told(self, b: int, problem: Problem) -> str:
         """What is wrong with the steps of problem b, in words: dt, the state and the shares."""
@@ -58,10 +58,14 @@ class StepErrors:
         name = f" ({names[where]})" if len(names) else ""
         error, cost = float(self.step_error[b]), float(self.step_cost[b])
         dt = "dt of a stage" if problem.time is not None else f"dt = {problem.dynamics.dt:g} s"
-        more = "" if cost != cost else f", and the cost by {cost:.2g} of itself"
-        more = more if not cost > 10.0 else ", and the cost by many times itself"
+        more = "" if cost != cost else f", and the cost by {self.cost_told(b)}"
         what = f"half of {dt} changes state {where}{name} by {error:.2g} of its range"
         return f"{what} at stage {int(self.stage[b])}{more}"
+
+    def cost_told(self, b: int, times: float = 1.0) -> str:
+        """A multiple of the step cost of problem b in words."""
+        cost = times * float(self.step_cost[b])
+        return "many times itself" if cost > 10.0 else f"{cost:.2g} of itself"
 
 
 def step_errors(
@@ -79,16 +83,19 @@ def step_errors(
         times: (B, N+1), s, of the knots where the time is free.
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
-            all stages together to be large, or no error of order 1 is above `HARMLESS_OF_FIRST`.
+            all stages together to be large.
         costates: finds them, or returns None where autodiff has to; None: it always has.
     """
     lost = X.new_full((problem.B,), torch.nan)
     zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
-    error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), torch.zeros_like(zeros, dtype=torch.bool))
+    none = torch.zeros_like(zeros, dtype=torch.bool)
+    error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), none, none.clone())
     if not _halves(problem):
         return error
     order = ORDER_OF[problem.dynamics.integrator]
-    too_much = (COARSE / problem.stages.to(X.dtype) ** order).clamp(min=(1.0 - 0.5**order) * LARGE_COST)
+    too_much = X.new_full((problem.B,), (1.0 - 0.5**order) * LARGE_COST)
+    if not is_users(problem.dynamics):
+        too_much = torch.maximum(too_much, COARSE / problem.stages.to(X.dtype) ** order)
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
             e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
@@ -97,7 +104,6 @@ def step_errors(
             asked = torch.isfinite(worst)
             if doubted:
                 asked &= share.amax(-1).sum(-1) > too_much[rows] / ELASTIC
-                asked &= worst > (HARMLESS_OF_FIRST if order == 1 else 0.0)
             costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
             chosen = asked.nonzero().flatten()
             if chosen.numel() > 0:
@@ -107,8 +113,9 @@ def step_errors(
                     problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()], costates
                 )
             error.step_cost[rows] = costs
-        large = LARGE_OF_FIRST if order == 1 else LARGE_ERROR
-        error.large[:] = (error.step_error > large) | (error.step_cost > too_much)
+        large = error.step_error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR)
+        costs = error.step_cost > too_much
+        error.large[:], error.of_cost[:] = large | costs, costs & ~large & (order == 1)
     return error
 
 
@@ -157,7 +164,7 @@ def _cost_of(
     costates: Costates | None,
 ) -> Tensor:
     """`StepErrors.step_cost` (B,) of the differences e (B, N, n)."""
-    found = None if costates is None or times is not None else costates(problem, X, U, multipliers)
+    found = None if costates is None else costates(problem, X, U, multipliers)
     whole, X, U = at_times(within_horizons(problem), X, at_rest_after(problem, U), times)
     try:
         found = _costates(whole, X, U, multipliers) if found is None else found

@@ -72,9 +72,9 @@ def value(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]
 def costates(problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> Tensor | None:
     """Slopes (B, N+1, n) of J_var + lam'c by the states, where later states follow from each; but those of the start.
 
-    None where no kernels in C have worked on problems of just this form.
+    None where no kernels in C have worked on problems of just this form, and where the time is free.
     """
-    if not problem.known.in_c or not native() or problem.horizon is not None:
+    if not problem.known.in_c or not native() or problem.horizon is not None or problem.time is not None:
         return None
     if any(row.joins_knots for row in problem.constraints):
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -32,10 +32,18 @@ MAX_FRAMES = 240  # longer flights are shown faster
 
 
 class Film(FuncAnimation):
-    """An animation that notebooks play."""
+    """An animation that notebooks play; `at(t)` draws an instant, s, and returns what it has drawn."""
+
+    def __init__(self, figure: Figure, at: Callable[[float], list[Artist]], times: np.ndarray) -> None:
+        self.at = at
+        pause = 1000 * float(times[-1]) / (len(times) - 1)
+        super().__init__(figure, at, frames=times.tolist(), interval=pause, cache_frame_data=False)
 
     def _repr_html_(self) -> str:
         return self.to_jshtml()
+
+    def __del__(self) -> None:
+        """A film may go unseen: matplotlib's own warns of that."""
 
 
 def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) -> Film:
@@ -54,7 +62,13 @@ def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) 
     _at_rest(scene).draw(figure)
     last = max(float(course.t[-1]) for course in courses)
     times = np.linspace(0.0, last, min(MAX_FRAMES, max(2, round(FPS * last) + 1)))
-    title = figure.axes[0].set_title("", fontsize=TITLE, loc="left", color=INK)
+    for ax in figure.axes[1:]:
+        ax.set_title(
+            f"from the side, what is at rest cut where problem {courses[0].b} flies", fontsize=TITLE, loc="left"
+        )
+    title = figure.axes[0].set_title("Mg", fontsize=TITLE, loc="left", color=INK)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the axes stay where they are
     shown = list[Artist]()
 
     def show(t: float) -> list[Artist]:
@@ -68,7 +82,7 @@ def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) 
                 shown.extend(_vehicle(ax, scene.world, course, plane, t))
         return shown
 
-    return Film(figure, show, frames=times.tolist(), interval=1000 * last / (len(times) - 1), cache_frame_data=False)
+    return Film(figure, show, times)
 
 
 def _at_rest(scene: SceneMap) -> SceneMap:

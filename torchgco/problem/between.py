@@ -55,7 +55,7 @@ def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     parts: list[Any] = [row.bare for row in problem.constraints if row.bare.on_the_way(X) is not None]
     if not parts or len(X) == 0:
         return off
-    middle, even = _within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
+    middle, even = states_within(problem, X, U, 2)[:, :, 0], 0.5 * (X[:, :-1] + X[:, 1:])
     for row in parts:
         apart = row.on_the_way(middle) - row.on_the_way(even)
         off = torch.maximum(off, apart.norm(dim=-1).flatten(1).amax(-1))
@@ -83,12 +83,14 @@ def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> 
             polylines.append(Paths(rows, 1, X[rows]))
             continue
         subset = problem.take(rows)
-        fine = torch.cat((X[rows, :-1].unsqueeze(2), _within(subset, X[rows], U[rows], count)), dim=2).flatten(1, 2)
+        fine = torch.cat((X[rows, :-1].unsqueeze(2), states_within(subset, X[rows], U[rows], count)), dim=2).flatten(
+            1, 2
+        )
         polylines.append(Paths(rows, count, torch.cat((fine, X[rows, -1:]), dim=1)))
     return polylines
 
 
-def _within(problem: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:
+def states_within(problem: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:
     """States (B, N, count - 1, n) at the ends of all but the last of `count` pieces of each stage."""
     N, dt = X.shape[1] - 1, float(problem.dynamics.dt)
     k = torch.arange(N, device=X.device).repeat_interleave(count - 1)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
-from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe, repeated
+from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
@@ -232,7 +232,7 @@ class Problem(Subset):
     def at_rest(self) -> tuple[Tensor, Tensor]:
         """States (B, N+1, n) that stay at the start, and controls (B, N, m) at rest."""
         like = self.x0.new_zeros(self.B, self.N, self.m)
-        return repeated(self.x0, self.N + 1), self.cost.rest_controls(like)
+        return self.dynamics.at_rest(self.x0, self.N), self.cost.rest_controls(like)
 
     def in_cost_units(self) -> Self:
         """The same problems with costs divided by `cost_unit`, without a constant that dwarfs the rest.

@@ -42,7 +42,8 @@ def held(problem: Problem, plan: Plan | None, now: float) -> Held:
         later = plan.moved_to(now)
         before, K = later.U, later.K
         lifted = rates_of(problem.constraints) is not None  # feedback could break the bounds of rates
-        ways = [before] if lifted else [followed(whole, later.X, before, K)[1], before]
+        own = whole if whole.n == problem.n else current(problem)  # feedback is on the problem's own states
+        ways = [before] if lifted else [followed(own, later.X, before, K)[1], before]
         best = _best(problem, whole, torch.stack(ways, dim=1), K, len(ways) - 1)
     for mixed in (False, True):
         if best is None:

@@ -174,7 +174,7 @@ class Tighten(Row):
     """The last solve, by the interior point: from the best trajectory.
 
     Problems that are unsolved, or miss a stated goal, are solved from other guesses, too, and with the goal required;
-    those with a required goal that doesn't bind, once without it.
+    those with a required goal that doesn't bind, or into which the terminal cost draws, once without it.
 
     Args:
         starts: so many guesses; 0: none, and no goal is required that isn't.

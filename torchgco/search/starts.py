@@ -171,17 +171,18 @@ class RequireGoal(Row):
 
 @dataclass(frozen=True)
 class ReleaseGoal(Row):
-    """Solves problems whose required goal doesn't bind without requiring it.
+    """Solves problems whose required goal doesn't bind, or into which the terminal cost draws, without requiring it.
 
-    Where it binds the cost leads out of the goal, and a solve without it ends outside. Where it doesn't, the cost alone
-    holds the end there, but what the row did on the way may have led past a cheaper trajectory. That is the first solve
-    again; where this one had failed, the whole table, as in `RequireGoal`. Those that were caught have been led along
-    ways to the goal. Nothing is solved of convex problems, nor where a state is required, an equality.
+    Where it binds the cost mostly leads out of the goal, and a solve without it ends outside. Where it doesn't, the
+    cost alone holds the end there, but what the row did on the way may have led past a cheaper trajectory; and so it
+    may where it binds although the terminal cost is less at the centre. That is the first solve again; where this one
+    had failed, of goals that don't bind the whole table, as in `RequireGoal`. Those that were caught have been led
+    along ways to the goal. Nothing is solved of convex problems, nor where a state is required, an equality.
     """
 
     label: ClassVar[str] = "release_goal"
     last: ClassVar[bool] = True
-    problems: ClassVar[str] = "never caught, within a required goal that doesn't bind"
+    problems: ClassVar[str] = "never caught, a required goal doesn't bind or the terminal cost draws into it"
     does: ClassVar[str] = "interior point without the goal required; where the first solve failed, the whole table"
 
     def run(self, search: Search) -> None:
@@ -193,14 +194,24 @@ class ReleaseGoal(Row):
         if is_convex(problem) or not Converge.worth(problem):
             return
         inside = goal.distance(best.X[:, -1, problem.position]) < goal.radius - ADMITTED
-        inside &= (
+        served = (
             (best.violation <= search.solver.violation_tolerance) & (first != STOPPED) & (first != Status.INVALID_START)
         )
         failed, once = ~is_over(first), partial(search.interior.solved, escapes=True)
-        for rows, solves in ((inside & ~failed, once), (inside & failed, search.again)):
+        drawn = inside | _draws_in(problem, best.X[:, -1])
+        for rows, solves in ((drawn & ~failed, once), (inside & failed, search.again)):
+            rows = rows & served
             if (some := rows.nonzero().flatten()).numel() > 0:
                 call = replace(search.call.take(some), callback=None, warm=None)
                 _propose(search, some, call, solves(replace(call, problem=call.problem.releasing_goal())))
+
+
+def _draws_in(problem: Problem, x: Tensor) -> Tensor:
+    """Whether the terminal cost of states x (B, n) is less with their position at the goal's centre, (B,) bool."""
+    goal, centred = problem.goal, x.clone()
+    assert goal is not None
+    centred[:, problem.position] = goal.position
+    return problem.cost.terminal(centred) < problem.cost.terminal(x)
 
 
 def _propose(search: Search, rows: Tensor, call: Call, end: SolveEnd) -> None:

@@ -146,10 +146,10 @@ def check_ids(ids: Any, problem: Problem) -> None:
         raise InputError("ids", f"an int64 tensor ({problem.B},) on {device}", describe(ids))
 
 
-def check_states(X0: Any, problem: Problem) -> None:
+def check_states(X0: Any, problem: Problem, field: str = "X0") -> None:
     """Raise InputError unless X0 is (B, N+1, n) of the problem's dtype and device."""
-    check_tensor(X0, "X0", problem.x0)
-    check_shape(X0, (problem.B, problem.N + 1, problem.n), "X0")
+    check_tensor(X0, field, problem.x0)
+    check_shape(X0, (problem.B, problem.N + 1, problem.n), field)
 
 
 LEAST_SECONDS = 1e-9  # of a solve for which no time is left

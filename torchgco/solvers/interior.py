@@ -85,8 +85,10 @@ class InteriorPoint(Solver, named="solver"):
         """Solve a checked call."""
         session, admitted = Session(call, own_units=True), self.admitted(call.problem)
         interior_of(session.call.problem)  # or an error that says what is missing
-        guess = guessed(session.call)
-        end = self.no_worse(session.call, guess, self.solved(session.call, guess=guess, escapes=True))
+        guess = guessed(session.call) if session.call.X0 is None else None
+        end = self.solved(session.call, guess=guess, escapes=True)
+        if not bool(is_over(end.status).all()):
+            end = self.no_worse(session.call, guess or guessed(session.call), end)
         return session.finished(least_violated(session.call, end, admitted), admitted)
 
     def admitted(self, problem: Problem) -> float:

@@ -9,6 +9,7 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import check_device
 from torchgco.kernels import kernels_of
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem, current_problem
 
 CPU_LIMIT = 256  # a larger batch is no faster on a core: the overhead that problems share is negligible by then
@@ -25,6 +26,7 @@ def least_bytes(N: int, n: int, m: int, rows: int) -> int:
 
 def element_bytes(problem: Problem) -> int:
     """Bytes that one problem of this form takes in a solve, measured to be within a factor of 2 (tests)."""
+    problem = for_solvers(problem)  # the form in which it is compiled, with states that rows of several knots carry
     N, n, m = problem.N, problem.n, problem.m
     z, s = n + 1, n + 1 + m
     single = problem.take(torch.zeros(1, dtype=torch.int64, device=problem.x0.device))

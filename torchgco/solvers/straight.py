@@ -16,14 +16,15 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 
 NEWTON_STEPS = 20  # of Gauss and Newton towards the rows of the last knot
+ROUNDINGS = 4.0  # of the largest state: no smaller step is made
 SOFT = 1e-12  # regularisation of a step, as a share of the largest entry of J J'
 
 
-def straight_line(problem: Problem) -> Tensor:
+def straight_line(problem: Problem, towards: Tensor | None = None) -> Tensor:
     """States X (B, N+1, n), evenly from the start to `asked_of_the_end`; the position leads through the gates."""
     share = torch.linspace(0.0, 1.0, problem.N + 1, dtype=problem.x0.dtype, device=problem.x0.device).view(1, -1, 1)
     x0 = torch.where(torch.isfinite(problem.x0), problem.x0, 0.0).unsqueeze(1)
-    X = (1.0 - share) * x0 + share * asked_of_the_end(problem).unsqueeze(1)
+    X = (1.0 - share) * x0 + share * asked_of_the_end(problem, towards).unsqueeze(1)
     legs = Legs.of(problem, X[:, -1])
     if legs is not None:
         X[..., problem.position] = legs.positions(problem.N)
@@ -79,15 +80,16 @@ class Legs:
         return (torch.searchsorted(self.knots, k, right=True) - 1).clamp(0, self.knots.shape[1] - 2)
 
 
-def asked_of_the_end(problem: Problem) -> Tensor:
+def asked_of_the_end(problem: Problem, towards: Tensor | None = None) -> Tensor:
     """States (B, n) near the start that keep the rows of the last knot, as far as steps of Gauss and Newton find any.
 
-    They begin at the state that the cost draws to, with the position of a stated goal, else at the start. Obstacles
-    don't count.
+    They begin at the state that the cost draws to, with the position of a stated goal, else at `towards` (B, n), or at
+    the start. Obstacles don't count.
     """
     x0 = torch.where(torch.isfinite(problem.x0), problem.x0, 0.0)
     drawn = problem.cost.goal(problem.x0)
-    z = x0.clone() if drawn is None else torch.where(torch.isfinite(drawn), drawn, x0)
+    near = x0 if towards is None else torch.where(torch.isfinite(towards), towards, x0)
+    z = near.clone() if drawn is None else torch.where(torch.isfinite(drawn), drawn, near)
     if problem.goal is not None and not problem.goal.assumed:
         z[:, problem.position] = problem.goal.position
     parts = [c for c in problem.constraints if c.holds_at(problem.N) and not isinstance(c, Obstacles)]
@@ -104,7 +106,11 @@ def asked_of_the_end(problem: Problem) -> Tensor:
         A = product(J, J.mT)
         A = A + torch.diag_embed((SOFT * A.abs().amax((1, 2)) + 1e-300).unsqueeze(-1).expand_as(c))
         step = (J * torch.linalg.solve_ex(A, c.unsqueeze(-1)).result).sum(1)
-        z = torch.where(torch.isfinite(step).all(-1, keepdim=True), z - step, z)
+        size = torch.maximum(z.abs(), x0.abs()).amax(-1)
+        moves = step.abs().amax(-1) > ROUNDINGS * torch.finfo(z.dtype).eps * size  # which NaN isn't
+        if not bool(moves.any()):
+            return z
+        z = torch.where((moves & torch.isfinite(step).all(-1)).unsqueeze(-1), z - step, z)
     return z
 
 

@@ -28,7 +28,7 @@ from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.results.durations import durations, with_lengths
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
-from torchgco.judging.judge import frame_columns, gates_passed, judge
+from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.kernels import use_native
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts
@@ -204,7 +204,7 @@ class SolveBatch(Batch):
         rows = pd.DataFrame(
             {
                 **self.shared, "layout": layouts.ids, "status": statuses, **frame_columns(verdict),
-                **durations(times), **gates_passed(checked.problem, verdict),
+                **durations(times), **more_columns(checked.problem, verdict),
                 **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),

@@ -29,6 +29,7 @@ NOTES = (
     "success: reached at no more than 5 % above the best known cost. clearance: the smallest distance to contact, "
     "between the knots, too, of those that reached. Seconds, hardware and seeds are what entrants say.",
 )
+OF_MODEL = ("model=", "model.", "vehicle=", "vehicle.")  # how words begin that have an effect
 SHOWN = 10_000  # rows of single layouts on a page, at most: some 4 MB
 COLUMNS: dict[str, str] = {
     "success": "reached at no more than 5 % above the best known cost",
@@ -59,8 +60,10 @@ class Scene:
             trust: whether the files may take any memory.
 
         Raises:
-            InputError: as `Layouts.load`, a model that doesn't fit, best costs of another shape.
+            InputError: as `Layouts.load`, a model that doesn't fit, other words, best costs of another shape.
         """
+        if other := [word for word in words if not word.lstrip("+~").startswith(OF_MODEL)]:
+            raise InputError("KEY=VALUE", f"words that name a model or change it: {', '.join(OF_MODEL)}", other[0])
         layouts = read_layouts(path, trust)
         named = any(word.startswith("model=") for word in words)
         model = [] if named else [f"model={usual_model(layouts)}"]

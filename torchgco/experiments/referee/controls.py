@@ -231,8 +231,13 @@ def _of_rows(
     U[layout_places, of_rows] = np.stack([values[f"u{i + 1}"][rows] for i in range(form.m)], axis=-1)
     if lengths is not None:
         lengths[layout_places, of_rows] = values["dt"][rows]
-    if "seconds" in values:
-        seconds[layout_places] = values["seconds"][rows]
+    if "seconds" in values:  # of a layout, in all of its rows or in some
+        most = seconds.copy()
+        np.fmin.at(seconds, layout_places, values["seconds"][rows])
+        np.fmax.at(most, layout_places, values["seconds"][rows])
+        if (unlike := seconds < most).any():
+            got = f"{seconds[unlike][0]:g} and {most[unlike][0]:g} for layout {form.ids[unlike][0]}"
+            raise _wrong(path, "the same seconds in all rows of a layout", got)
     return form.controls(name, U, lengths, seconds)
 
 

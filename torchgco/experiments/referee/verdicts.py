@@ -17,7 +17,7 @@ from torchgco.experiments.results.identity import layout_digests
 from torchgco.experiments.results.success import with_success
 from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
-from torchgco.judging.judge import frame_columns, gates_passed, judge
+from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.scenarios import Layouts, Task, Vehicle
 
 AT_ONCE = 64  # layouts judged at once
@@ -79,7 +79,7 @@ def _rows(task: Task, solver: Controls, places: np.ndarray) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "layout": task.layouts.ids, "solver": solver.name, "status": status, **frame_columns(verdict),
-            **durations(times), **gates_passed(problem, verdict), **certificate_columns(certificate),
+            **durations(times), **more_columns(problem, verdict), **certificate_columns(certificate),
             "seconds": solver.seconds[places], "settings_digest": solver.digest,
         }
     )  # fmt: skip

@@ -43,7 +43,7 @@ from torchgco.experiments.results.variants import values_of
 from torchgco.experiments.statistics.statistics import swept_columns
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.fleets.drawn import solution_of
-from torchgco.judging.judge import frame_columns, gates_passed, judge
+from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.tables import STATES, step_columns
@@ -200,7 +200,7 @@ def _trajectories(
             times = times_at(held_times, stored, task.problem.N)
             verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
             columns = {"solver": name, "layout": ids, **frame_columns(verdict)}
-            more = durations(times) | gates_passed(task.problem, verdict)
+            more = durations(times) | more_columns(task.problem, verdict)
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
     return rows.set_index(TRIAL)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]

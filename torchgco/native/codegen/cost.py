@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,8 +13,9 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import apart
 from torchgco.costs.base import Cost, ScaledCost, ShiftedCost
-from torchgco.native.codegen import calls
-from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_source
+from torchgco.native.codegen import calls, emit
+from torchgco.native.codegen.dynamics import names_of
+from torchgco.native.codegen.knot import Knot, KnotSource, Span, knot_parts
 from torchgco.native.structures import Array, Quadratic, TracedCost, array
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
@@ -62,10 +63,9 @@ def trace_cost(problem: Problem) -> CostSource:
         raise InputError(_named("total", cost), "the sum of stage and terminal costs for native kernels", "its own")
     block = None if type(cost).expand is Cost.expand else problem.n + 1 + problem.m
     stage, last = spans_of_cost(problem)
-    return CostSource(
-        knot_source("stage", stage, partial(_code, "stage", block), __file__),
-        knot_source("last", last, partial(_code, "last", block), __file__),
-    )
+    spans = {"stage": stage, "last": last}
+    sources = (knot_parts(name, span, partial(_parts, name, block), __file__)[0] for name, span in spans.items())
+    return CostSource(*sources)
 
 
 def cost_arrays(problem: Problem, source: CostSource, shared: tuple[Tensor, Tensor]) -> list[Array]:
@@ -128,27 +128,40 @@ def _named(method: str, cost: Cost) -> str:
     return f"cost.{method} ({type(cost).__name__})"
 
 
-def _code(name: str, block: int | None, knot: Knot, _: str) -> str:
+def _parts(name: str, block: int | None, knots: Sequence[Knot], _: str) -> dict[str, Any]:
+    """The code of a cost at a stage, or the last knot, for each form of knots."""
+    value, entries = f"tgco_{name}_value", f"tgco_{name}_entries"
+    derived = [_derivatives(knot) if block is None else _blocks(knot, block) for knot in knots]
+    size = knots[0].x.numel() + knots[0].u.numel()
+    of_gradient = lambda i: any(not gradient[i].is_zero() for gradient, *_ in derived)
+    of_hessian = lambda i, j: any(not hessian[i, j].is_zero() for _, hessian, _ in derived)
+    slopes = [i for i in range(size) if of_gradient(i)]
+    curvatures = [(i, j) for i in range(size) for j in range(i, size) if of_hessian(i, j)]
+    places, code = [*slopes, *(i * size + j for i, j in curvatures)], list[str]()
+    for knot, (gradient, hessian, stages), of in zip(knots, derived, names_of(knots, value, entries), strict=True):
+        column = [*(gradient[i] for i in slopes), *(hessian[i, j] for i, j in curvatures)]
+        code += [_value_code(knot, of[0]), _entries_code(knot, of[1], column, stages)]
+    if len(knots) > 1:
+        code += [emit.by_form(function, len(knots), len(knots[0].inputs), 1) for function in (value, entries)]
+    code += [
+        f"static const int tgco_{name}_places[] = {{{', '.join(map(str, places or [0]))}}};",
+        f"#define {name.upper()}_SLOPES {len(slopes)}",
+        f"#define {name.upper()}_ENTRIES {len(places)}",
+    ]
+    return {"code": "\n".join(code)}
+
+
+def _value_code(knot: Knot, name: str) -> str:
     import casadi as ca
 
-    inputs, value = knot.inputs, knot.rows[0]
-    gradient, hessian, stages = _derivatives(knot) if block is None else _blocks(knot, block)
-    size = knot.x.numel() + knot.u.numel()
-    slopes = [(i, gradient[i]) for i in range(size) if not gradient[i].is_zero()]
-    curvatures = [
-        (i * size + j, hessian[i, j]) for i in range(size) for j in range(i, size) if not hessian[i, j].is_zero()
-    ]
-    places, entries = [[pair[which] for pair in (*slopes, *curvatures)] for which in (0, 1)]
+    return calls.emit_staged(name, knot.inputs, [ca.densify(knot.rows[0])], calls.values(knot.calls))
+
+
+def _entries_code(knot: Knot, name: str, entries: Sequence[Any], stages: Sequence[calls.Stage]) -> str:
+    import casadi as ca
+
     column = ca.cse(ca.densify(ca.vertcat(ca.SX(0, 1), *entries)))
-    return "\n".join(
-        [
-            calls.emit_staged(f"tgco_{name}_value", inputs, [ca.densify(value)], calls.values(knot.calls)),
-            calls.emit_staged(f"tgco_{name}_entries", inputs, [column], stages),
-            f"static const int tgco_{name}_places[] = {{{', '.join(map(str, places or [0]))}}};",
-            f"#define {name.upper()}_SLOPES {len(slopes)}",
-            f"#define {name.upper()}_ENTRIES {len(entries)}",
-        ]
-    )
+    return calls.emit_staged(name, knot.inputs, [column], stages)
 
 
 def _derivatives(knot: Knot) -> tuple[Any, Any, list[calls.Stage]]:

@@ -8,10 +8,9 @@ from typing import Any
 from torchgco.native import store
 from torchgco.native.codegen import calls, emit
 from torchgco.native.codegen.constraint import places_of, squares
-from torchgco.native.codegen.dynamics import DynamicsSource, computed_entries, makers, stepped
-from torchgco.native.codegen.knot import Knot, KnotSource, knot_source
+from torchgco.native.codegen.dynamics import DynamicsSource, Step, computed_entries, makers, names_of, stepped
+from torchgco.native.codegen.knot import Knot, KnotSource, knot_parts, knot_source
 from torchgco.native.codegen.stages import StagesSource
-from torchgco.tracing.nets import Call
 
 # Operations whose derivatives are finite wherever their arguments are.
 SMOOTH_OPERATIONS = (
@@ -46,24 +45,30 @@ def _model_code(model: DynamicsSource) -> str:
     """
 
     if isinstance(model, StagesSource):
-        code_of = lambda knot, _: _step_code(knot.inputs, knot.rows, knot.calls)
-        return knot_source("curvature", model.stage.span, code_of, __file__).code
+        steps_of = lambda knots: [(knot.inputs, knot.rows, knot.calls) for knot in knots]
+        code_of = lambda knots, _: {"code": _step_code(model, steps_of(knots))}
+        return knot_parts("curvature", model.stage.span, code_of, __file__)[0].code
     key, traced = ("curvature", model.key, *makers(__file__)), model.traced
-    make = lambda: {"code": _step_code(*stepped(traced, model.n, model.m))}
+    make = lambda: {"code": _step_code(model, [stepped(traced, model.n, model.m)])}
     return emit.checked(traced.field, store.made(key, make, f"curvature {traced.kin}").content["code"])
 
 
-def _step_code(inputs: Sequence[Any], ahead: Any, net_calls: Sequence[Call]) -> str:
-    """Of a step `ahead` (n), CasADi's column, with calls of networks."""
+def _step_code(model: DynamicsSource, steps: Sequence[Step]) -> str:
+    """Of steps, one for each form of stages."""
     import casadi as ca
 
-    y = ca.SX.sym("y", ahead.numel())
-    if not net_calls:
-        return _curves("tgco_curve", [*inputs, y], ca.dot(y, ahead))
-    tangents = calls.Ahead(net_calls, ca.vertcat(*inputs[:2]))
-    slopes = computed_entries(tangents.jacobian(ahead))
-    code = _curves("tgco_together", [*inputs, y], ca.dot(y, ahead), tangents, slopes)
-    return f"{code}\n#define TGCO_TOGETHER"
+    together = any(found for *_, found in steps)
+    name = "tgco_together" if together else "tgco_curve"
+    lists, code = {key: getattr(model, key) for key in ("rows", "columns", "places")}, list[str]()
+    for (inputs, ahead, found), (of,) in zip(steps, names_of(steps, name), strict=True):
+        y, tangents, slopes = ca.SX.sym("y", ahead.numel()), None, None
+        if together:
+            tangents = calls.Ahead(found, ca.vertcat(*inputs[:2]))
+            slopes = computed_entries(tangents.jacobian(ahead), lists)
+        code.append(_curves(of, [*inputs, y], ca.dot(y, ahead), tangents, slopes))
+    if len(steps) > 1:
+        code.append(emit.by_form(name, len(steps), 5, 1 + together))
+    return "\n".join([*code, *(["#define TGCO_TOGETHER"] if together else [])])
 
 
 def _rows_code(knot: Knot, name: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -98,14 +98,19 @@ def trace_dynamics(
     step = lambda i, x, u: dynamics.take(i).step(x, u)
     traced = Traced("dynamics.step", step, x, u, own=own_tensors(dynamics))
     key = "model", traced.fingerprint(), *makers()
-    parts = store.made(key, lambda: step_parts(*stepped(traced, n, m)), f"model {traced.kin}")
+    parts = store.made(key, lambda: step_parts([stepped(traced, n, m)]), f"model {traced.kin}")
     lists = {name: tuple(parts.content[name]) for name in ("rows", "columns", "places", "values")}
     code, affine = emit.checked(traced.field, parts.content["code"]), parts.content["affine"]
     return DynamicsSource(n, m, traced.count, code, **lists, affine=affine, key=parts.key, traced=traced)
 
 
-def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any, list[Call]]:
-    """CasADi's columns x (n), u (m), p and w, and the step (n) that a trace makes of them, with calls of networks."""
+Step = tuple[
+    list[Any], Any, Sequence[Call]
+]  # CasADi's columns x (n), u (m), p and w, the next x (n), calls of networks
+
+
+def stepped(traced: Traced, n: int, m: int) -> Step:
+    """The step that a trace makes."""
     import casadi as ca
 
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", m)
@@ -116,33 +121,43 @@ def stepped(traced: Traced, n: int, m: int) -> tuple[list[Any], Any, list[Call]]
     return [x, u, p, w], ca.densify(ca.vertcat(*ahead)), net_calls
 
 
-def step_parts(inputs: Sequence[Any], ahead: Any, found: Sequence[Call]) -> dict[str, Any]:
-    """The code of a step `ahead` (n) of inputs x, u, p, w, CasADi's columns, and the lists of a DynamicsSource.
-
-    `found` are the calls of networks in it.
-    """
+def step_parts(steps: Sequence[Step]) -> dict[str, Any]:
+    """The code of steps, one for each form of stages, and the lists of a DynamicsSource."""
     import casadi as ca
 
-    tangents = calls.Ahead(found, ca.vertcat(*inputs[:2]))
-    jacobian = tangents.jacobian(ahead)
-    step, jacobian = ca.cse([ahead, jacobian])
-    rows, columns = jacobian.sparsity().get_triplet()
-    entries: list[Any] = jacobian.nonzeros()
-    changing = computed_entries(jacobian)
-    fixed: list[bool] = [entry.is_constant() for entry in entries]
-    places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1)
-    code = [
-        calls.emit_staged(name, inputs, [ca.densify(result)], stages)
-        for name, result, stages in ((STEP_FUNCTION, step, calls.values(found)), (JACOBIAN, changing, tangents.stages))
-    ]
-    return {
-        "code": "\n".join(code),
-        "rows": list(rows),
-        "columns": list(columns),
-        "places": places.tolist(),
-        "values": [float(entry) if is_fixed else 0.0 for entry, is_fixed in zip(entries, fixed, strict=True)],
-        "affine": not found and _is_affine(inputs, step, changing),
-    }
+    names, code, affine = names_of(steps, STEP_FUNCTION, JACOBIAN), list[str](), True
+    tangents = [calls.Ahead(found, ca.vertcat(*inputs[:2])) for inputs, _, found in steps]
+    jacobians = [along.jacobian(ahead) for along, (_, ahead, _) in zip(tangents, steps, strict=True)]
+    lists = nonzeros(jacobians)
+    for (inputs, ahead, found), along, jacobian, of in zip(steps, tangents, jacobians, names, strict=True):
+        step, jacobian = ca.cse([ahead, jacobian])
+        changing = computed_entries(jacobian, lists)
+        stages = calls.values(found), along.stages
+        code += map(calls.emit_staged, of, [inputs] * 2, ([ca.densify(step)], [changing]), stages)
+        affine = affine and not found and _is_affine(inputs, step, changing)
+    if len(steps) > 1:
+        code += [emit.by_form(name, len(steps), 4, 1) for name in (STEP_FUNCTION, JACOBIAN)]
+    return {"code": "\n".join(code), **lists, "affine": affine}
+
+
+def names_of(forms: Sequence[Any], *names: str) -> list[list[str]]:
+    """Of each form the names of its functions, which `emit.by_form` calls; of one alone those that others call."""
+    return [[f"{name}_{i}" if len(forms) > 1 else name for name in names] for i in range(len(forms))]
+
+
+def nonzeros(jacobians: Sequence[Any]) -> dict[str, list[Any]]:
+    """`rows`, `columns`, `places` and `values` of a DynamicsSource: of entries that aren't 0 in some form."""
+    import casadi as ca
+
+    some = ca.DM(jacobians[0].sparsity(), 1.0)
+    for jacobian in jacobians[1:]:
+        some += ca.DM(jacobian.sparsity(), 1.0)
+    rows, columns = some.sparsity().get_triplet()
+    each = [[jacobian[i, j] for jacobian in jacobians] for i, j in zip(rows, columns, strict=True)]
+    fixed = [all(e.is_constant() for e in entries) and len({float(e) for e in entries}) == 1 for entries in each]
+    places = np.where(fixed, -1, np.cumsum(np.logical_not(fixed)) - 1).tolist()
+    values = [float(entries[0]) if same else 0.0 for entries, same in zip(each, fixed, strict=True)]
+    return {"rows": list(rows), "columns": list(columns), "places": places, "values": values}
 
 
 def _is_affine(inputs: Sequence[Any], step: Any, changing: Any) -> bool:
@@ -155,11 +170,12 @@ def _is_affine(inputs: Sequence[Any], step: Any, changing: Any) -> bool:
     return smooth and not ca.depends_on(changing, ca.vertcat(*inputs[:2]))
 
 
-def computed_entries(jacobian: Any) -> Any:
-    """The column of a Jacobian's nonzeros that `tgco_jacobian` writes: those that aren't constants."""
+def computed_entries(jacobian: Any, lists: Mapping[str, Sequence[Any]]) -> Any:
+    """The column of a Jacobian's entries that `tgco_jacobian` writes: those that aren't constants by `nonzeros`."""
     import casadi as ca
 
-    return ca.vertcat(ca.SX(0, 1), *(entry for entry in jacobian.nonzeros() if not entry.is_constant()))
+    where = zip(lists["rows"], lists["columns"], lists["places"], strict=True)
+    return ca.densify(ca.vertcat(ca.SX(0, 1), *(jacobian[i, j] for i, j, place in where if place >= 0)))
 
 
 def elements(column: Any) -> np.ndarray:

@@ -27,6 +27,7 @@ _OF_ONE = (
 _OF_TWO = ("pow", "fmod", "atan2", "hypot", "copysign")
 
 
+NUMBERS_AT = 2  # of the functions of a model, a cost, a constraint: the input with a knot's own numbers p
 SHARED_AT = 3  # of the functions of a model, a cost, a constraint: the input with the numbers that all problems share
 
 
@@ -158,6 +159,18 @@ def _value(function: ca.Function, k: int, read: list[str], shared: int | None) -
 def switch(head: str, cases: Iterable[str], *end: str) -> str:
     """A function of C that chooses by its argument i."""
     return "\n".join((f"{head} {{", "    switch (i) {", *cases, "    }", *end, "}"))
+
+
+def by_form(name: str, forms: int, inputs: int, outputs: int) -> str:
+    """`NAME`, which calls `NAME_0`, `NAME_1`, ...: of the form that the first of the numbers p says, without it.
+
+    Problems side by side are at the same knot, and so of the same form.
+    """
+    arguments = [f"{input_type(i)} in{i}" for i in range(inputs)] + [f"OUT out{i}" for i in range(outputs)]
+    passed = [f"in{i}{' + 1' if i == NUMBERS_AT else ''}" for i in range(inputs)] + [f"out{i}" for i in range(outputs)]
+    cases = [f"    case {i}: {name}_{i}({', '.join(passed)}); break;" for i in range(forms)]
+    head = f"TGCO_APART void {name}({', '.join(arguments)})"
+    return "\n".join([f"{head} {{", f"    switch ((int)LANE(in{NUMBERS_AT}[0], 0)) {{", *cases, "    }", "}"])
 
 
 def literal(value: float) -> str:

@@ -1,8 +1,9 @@
 """The function of one knot, found in a traced function of whole trajectories: PyTorch code sees the shapes that it is
 written for, and C works knot by knot.
 
-Values that PyTorch computes from k (a reference for each knot, say) become the knot's own numbers; nothing else may
-differ from knot to knot.
+Values that PyTorch computes from k (a reference for each knot, say) become the knot's own numbers. Where operations
+differ from knot to knot, too, as in phases with a model each, every form of a knot has its own code, and the first of a
+knot's numbers says which it is.
 """
 
 from __future__ import annotations
@@ -61,13 +62,14 @@ class Knot:
 class KnotSource:
     """C of one knot's rows (size), and where its numbers come from.
 
-    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span` and
-    the numbers that all problems share.
+    `places` (K|1, count) are the numbers' positions in a problem's own numbers followed by the constants of `span`, the
+    numbers 0, 1, ... of the forms, where there are several, and the numbers that all problems share.
     """
 
     code: str
     key: str  # says what `code` computes, the same in every process and for every number of knots
     size: int
+    forms: int  # of knots
     places: Tensor = field(compare=False)
     span: Span = field(repr=False, compare=False)
 
@@ -95,7 +97,7 @@ class KnotSource:
         Raises:
             InputError: the problems have another function.
         """
-        fixed = torch.cat((torch.from_numpy(self.span.traced.constants), shared))
+        fixed = self._fixed(self.span.traced, shared)
         if not self._is_own:
             return fixed[self.places - self.span.traced.count].unsqueeze(0)
         traced = self.span.traced.rebound(tensors, B)
@@ -103,9 +105,14 @@ class KnotSource:
             traced = again().traced
             if traced.fingerprint() != self.span.traced.fingerprint():
                 raise InputError(traced.field, "the same operations for all subsets of a batch", "others")
-        count, fixed = traced.count, torch.cat((torch.from_numpy(traced.constants), shared))
+        count, fixed = traced.count, self._fixed(traced, shared)
         each = traced.parameters_of(torch.arange(B))[:, self.places.clamp(max=count - 1)]
         return torch.where(self.places < count, each, torch.cat((fixed.new_zeros(count), fixed))[self.places])
+
+    def _fixed(self, traced: Traced, shared: Tensor) -> Tensor:
+        """The numbers after a problem's own ones."""
+        forms = torch.arange(self.forms if self.forms > 1 else 0, dtype=shared.dtype)
+        return torch.cat((torch.from_numpy(traced.constants), forms, shared))
 
 
 def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *files: str) -> KnotSource:
@@ -118,34 +125,101 @@ def knot_source(kind: str, span: Span, code_of: Callable[[Knot, str], str], *fil
     Raises:
         InputError: an operation without a counterpart; rows that join knots, or whose operations differ between knots.
     """
-    return knot_parts(kind, span, lambda knot, key: {"code": code_of(knot, key)}, *files)[0]
+
+    def parts_of(knots: Sequence[Knot], key: str) -> dict[str, Any]:
+        if len(knots) > 1:
+            raise InputError(span.traced.field, "the same operations at every knot", f"{len(knots)} forms of them")
+        return {"code": code_of(knots[0], key)}
+
+    return knot_parts(kind, span, parts_of, *files)[0]
 
 
 def knot_parts(
-    kind: str, span: Span, parts_of: Callable[[Knot, str], dict[str, Any]], *files: str
+    kind: str, span: Span, parts_of: Callable[[Sequence[Knot], str], dict[str, Any]], *files: str
 ) -> tuple[KnotSource, dict[str, Any]]:
-    """`knot_source` of parts, of which "code" is one, and these parts."""
+    """`knot_source` of parts, of which "code" is one, of all forms of knots, and these parts."""
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
 
     def make() -> dict[str, Any]:
-        import casadi as ca
-
-        knot, places = _one_knot(span)
-        made = [call.outputs for call in knot.calls]
-        function = ca.Function("knot", [*knot.inputs, *made], [knot.rows, *(call.inputs for call in knot.calls)])
-        form = span.n, span.m, *_form(function), *(key_of(call.net) for call in knot.calls)
-        name = store.key_of((kind, str(form), *makers(__file__, *files)))[:16]
-        return {**parts_of(knot, name), "name": name, "size": knot.rows.numel(), "numbers_at": places}
+        knots, places = _knots(span)
+        form: list[Any] = [span.n, span.m]
+        for knot in knots:
+            form += [*_form(_whole(knot))[0], *(key_of(call.net) for call in knot.calls)]
+        name, size = store.key_of((kind, str(tuple(form)), *makers(__file__, *files)))[:16], knots[0].rows.numel()
+        parts = {"name": name, "size": size, "forms": len(knots), "numbers_at": places}
+        return {**parts_of(knots, name), **parts}
 
     key = kind, shape, span.traced.fingerprint(), *makers(__file__, *files)
     _, parts = store.made(key, make, f"{kind} {shape} {span.traced.kin}")
     emit.checked(span.traced.field, parts["code"])
     places = torch.tensor(parts["numbers_at"], dtype=torch.int64).reshape(len(parts["numbers_at"]), -1)
-    return KnotSource(parts["code"], parts["name"], parts["size"], places, span), parts
+    return KnotSource(parts["code"], parts["name"], parts["size"], parts["forms"], places, span), parts
 
 
-def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
-    """The function that all knots share, and the places (K|1, count) of each knot's numbers."""
+def _whole(knot: Knot) -> Any:
+    """A knot as CasADi's function, with the inputs of its calls."""
+    import casadi as ca
+
+    made = [call.outputs for call in knot.calls]
+    return ca.Function("knot", [*knot.inputs, *made], [knot.rows, *(call.inputs for call in knot.calls)])
+
+
+@dataclass
+class _Form:
+    """Knots with the same operations: the first one's function, the numbers that it reads, and the calls in it."""
+
+    function: Any
+    reads: list[int]
+    calls: list[Call]
+    knots: list[int]  # among those of the span
+    places: list[list[int]]  # of each: where the numbers that it uses come from
+    used: list[int]  # of the numbers that the first one reads those that it uses
+
+    def made(self, values: Sequence[Any], count: int, span: Span, w: Any) -> tuple[Knot, list[list[int]]]:
+        """The form as one knot, and the places (K|1, count) of its knots' numbers.
+
+        Args:
+            values: of all numbers those that are the same in all problems.
+            count: how many of them come first that are a problem's own.
+        """
+        import casadi as ca
+
+        differ = [len(set(column)) > 1 for column in zip(*self.places, strict=True)]
+        varying = [i for i, position in enumerate(self.places[0]) if position < count or differ[i]]
+        x, u, p = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m), ca.SX.sym("p", len(varying))
+        values = list(values)
+        for i, slot in enumerate(varying):
+            values[self.places[0][slot]] = p[i]
+        made = [ca.SX.sym(f"o{i}", call.net.size) for i, call in enumerate(self.calls)]
+        read = ca.vertcat(ca.SX(0, 1), *(values[i] for i in self.reads))
+        rows, *points = self.function.call([x, u, read, *made])
+        chosen = [[used[i] for i in varying] for used in (self.places if any(differ) else self.places[:1])]
+        found = [Call(call.net, point, out) for call, point, out in zip(self.calls, points, made, strict=True)]
+        return Knot(x, u, p, w, rows, found), chosen
+
+
+def _knots(span: Span) -> tuple[list[Knot], list[list[int]]]:
+    """The knots of a function, one for each form, and the places (K|1, count) of each knot's numbers."""
+    import casadi as ca
+
+    traced, forms = span.traced, _forms(span)
+    values: list[Any] = [0.0] * traced.count + traced.constants.tolist()
+    w = ca.SX.sym("w", len(traced.pattern))
+    values += [w[i] if np.isnan(value) else value for i, value in enumerate(traced.pattern.tolist())]
+    made = [form.made(values, traced.count, span, w) for form in forms]
+    if len(made) == 1:
+        return [made[0][0]], made[0][1]
+    first_shared, width = traced.count + len(traced.constants), max(len(rows[0]) for _, rows in made)
+    places: list[list[int]] = [[] for _ in span.knots]
+    for number, (form, (_, rows)) in enumerate(zip(forms, made, strict=True)):
+        for i, row in zip(form.knots, rows if len(rows) > 1 else rows * len(form.knots), strict=True):
+            moved = [slot if slot < first_shared else slot + len(forms) for slot in row]
+            places[i] = [first_shared + number, *moved, *[first_shared] * (width - len(row))]
+    return [knot for knot, _ in made], places
+
+
+def _forms(span: Span) -> list[_Form]:
+    """The forms of the knots of a traced function, in the order in which they are met."""
     import casadi as ca
 
     traced, count = span.traced, span.traced.count
@@ -165,50 +239,30 @@ def _one_knot(span: Span) -> tuple[Knot, list[list[int]]]:
         shared=each[first_shared:],
         calls=calls.all,
     ).reshape(len(span.knots), -1)
-    x, u = ca.SX.sym("x", span.n), ca.SX.sym("u", span.m)
+    u = ca.SX.sym("u", span.m)
     index = {number.element_hash(): i for i, number in enumerate(each)}
-    reads, places, forms, common = [], [], {}, None
-    first: Any = None
+    texts: dict[str, tuple[list[tuple], list[int]]] = {}
+    forms: dict[tuple, _Form] = {}
     columns, width = ca.densify(ca.vertcat(ca.SX(0, 1), *found.ravel())), found.shape[1]
-    for k, column in zip(span.knots, ca.vertsplit(columns, width) if width else [columns] * len(found), strict=True):
+    rows = ca.vertsplit(columns, width) if width else [columns] * len(found)
+    for i, (k, column) in enumerate(zip(span.knots, rows, strict=True)):
         inside = calls.inside(column)
-        made = [call.outputs for call in inside]
         results = [column, *(call.inputs for call in inside)]
         # Its own numbers alone: functions of those of all knots would together be as long as the horizon squared.
-        reads.append([index[name] for name in _names(*results) if name in index])
-        inputs = [
-            X[k],
-            U[k] if k < span.controls else u,
-            numbers[reads[-1]],
-            *made,
-        ]
+        reads = [index[name] for name in _names(*results) if name in index]
+        inputs = [X[k], U[k] if k < span.controls else u, numbers[reads], *(call.outputs for call in inside)]
         function = ca.Function("knot", inputs, results, {"allow_free": True})
         if function.has_free():
             raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
-        first = first or function
         text = function.serialize()
-        if text not in forms:
-            forms[text] = _form(function)
-        form, used = forms[text]
-        form = [*form, *(calls.key(call) for call in inside)]
-        places.append([reads[-1][i] for i in used])
-        common = common or form
-        if form != common:
-            raise InputError(traced.field, "the same operations at every knot", f"others at knot {k}")
-    differ = [len(set(column)) > 1 for column in zip(*places, strict=True)]
-    varying = [i for i, position in enumerate(places[0]) if position < count or differ[i]]
-    p, w = ca.SX.sym("p", len(varying)), ca.SX.sym("w", len(pattern))
-    values: list[Any] = [0.0] * count + constants.tolist()
-    values += [w[i] if np.isnan(value) else value for i, value in enumerate(pattern.tolist())]
-    for i, slot in enumerate(varying):
-        values[places[0][slot]] = p[i]
-    inside = calls.first
-    made = [ca.SX.sym(f"o{i}", call.net.size) for i, call in enumerate(inside)]
-    read = ca.vertcat(ca.SX(0, 1), *(values[i] for i in reads[0]))
-    rows, *points = first.call([x, u, read, *made])
-    chosen = [[used[i] for i in varying] for used in (places if any(differ) else places[:1])]
-    found = [Call(call.net, point, out) for call, point, out in zip(inside, points, made, strict=True)]
-    return Knot(x, u, p, w, rows, found), chosen
+        if text not in texts:
+            texts[text] = _form(function)
+        operations, used = texts[text]
+        key = (*operations, *(calls.key(call) for call in inside))
+        form = forms.setdefault(key, _Form(function, reads, inside, [], [], used))
+        form.knots.append(i)
+        form.places.append([reads[i] for i in used])
+    return list(forms.values())
 
 
 class _Calls:
@@ -216,10 +270,8 @@ class _Calls:
 
     def __init__(self) -> None:
         self.all: list[Call] = []
-        self.first: list[Call] = []  # those of the first knot that was asked for
         self._owners: dict[int, int] = {}  # the call that makes a symbol
         self._keys: dict[int, str] = {}
-        self._asked = False
 
     def inside(self, rows: Any) -> list[Call]:
         """The calls that rows depend on, be it through other calls, in order."""
@@ -231,10 +283,7 @@ class _Calls:
             read = {self._owners[name] for name in _names(open_.pop()) if name in self._owners} - places
             places |= read
             open_ += [self.all[i].inputs for i in read]
-        reached = [self.all[i] for i in sorted(places)]
-        if not self._asked:
-            self._asked, self.first = True, reached
-        return reached
+        return [self.all[i] for i in sorted(places)]
 
     def key(self, call: Call) -> str:
         """What a call computes."""

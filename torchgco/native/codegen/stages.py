@@ -1,4 +1,4 @@
-"""C of a model that differs from stage to stage: its step at one stage, with the numbers of each stage."""
+"""C of a model that differs from stage to stage: its step at each form of a stage, with the numbers of each stage."""
 
 from __future__ import annotations
 
@@ -31,14 +31,13 @@ def trace_model(problem: Problem) -> DynamicsSource:
     """The C of a problem's dynamics, taken from the cache folder if it was made before.
 
     Raises:
-        InputError: a step that can't be traced, holds an operation without a counterpart, or differs between stages in
-            more than its numbers.
+        InputError: a step that can't be traced, or holds an operation without a counterpart.
     """
     model = problem.dynamics
     if problem.along is model:
         return trace_dynamics(model)
     span = _span(model, problem.N)
-    make = lambda knot, _: step_parts(knot.inputs, knot.rows, knot.calls)
+    make = lambda knots, _: step_parts([(knot.inputs, knot.rows, knot.calls) for knot in knots])
     source, parts = knot_parts("stages", span, make, __file__, str(code.__file__))
     lists = {name: tuple(parts[name]) for name in ("rows", "columns", "places", "values")}
     count = source.places.shape[1]

@@ -1,0 +1,81 @@
+"""From phases to their trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+from torch import Tensor
+
+from torchgco.base.errors import InputError
+from torchgco.base.shapes import computing_on
+from torchgco.judging.steps import Costates
+from torchgco.kernels import costates
+from torchgco.phases.guess import Rest, guess
+from torchgco.phases.lowered import Span, Whole
+from torchgco.phases.phases import Phases
+from torchgco.phases.solution import PhasesSolution
+from torchgco.problem.problem import Problem
+from torchgco.solvers.contracts import CHOOSING_TIME, Solver
+from torchgco.solvers.ending import judged_between
+from torchgco.warned import warn_of
+
+WHOLE = "whole"  # what phases keep of their solves
+
+
+def solve_phases(
+    phases: Phases,
+    solver: Solver,
+    U0: Any,
+    X0: Any,
+    seed: int,
+    ids: Tensor | None,
+    warm: PhasesSolution | None,
+    max_seconds: float | None,
+    rest: Rest,
+) -> PhasesSolution:
+    """The solution of phases; arguments are those of `torchgco.solve`.
+
+    Args:
+        rest: controls at rest.
+    """
+    with computing_on(phases.members[0].x0.device):
+        whole = phases.derived[WHOLE] = Whole.current(phases, phases.derived.get(WHOLE))
+        if any(one.time is not None for one in whole.members) and solver.choosing_time(whole.problem) is None:
+            raise InputError("solver", CHOOSING_TIME, type(solver).__name__)
+        X, U = guess(whole, U0, X0, rest) if warm is None else _warm(whole, warm)
+        problem = whole.problem.guessing(X[:, 0])
+        X = X if solver.take_states(problem) else None
+        multipliers = None if warm is None else warm.found.multipliers
+        found = solver.solve(problem, U, seed, ids, multipliers, None, max_seconds, X)
+        status = found.status
+        for form, span in zip(whole.forms, whole.spans, strict=True):
+            status = judged_between(form, *span.own(found.X, found.U), status)
+        solution = PhasesSolution(whole, replace(found, status=status), solver)
+        slopes = cache(lambda: costates(problem, found.X, found.U, found.multipliers.lam))
+        for member, part, span in zip(whole.members, solution, whole.spans, strict=True):
+            warn_of(member, part, False, _costates(member, span, slopes))
+        return solution
+
+
+def _costates(member: Problem, span: Span, slopes: Callable[[], Tensor | None]) -> Costates:
+    """Those of a phase among the slopes (B, N+1, n) of all phases; of some problems of the phase."""
+
+    def of(problem: Problem, X: Tensor, U: Tensor, multipliers: Sequence[Tensor]) -> Tensor | None:
+        every = None if member.part_of is not None else slopes()
+        rows = slice(None) if problem.part_of is None else problem.part_of[1]
+        return None if every is None else every[rows, span.knots]
+
+    return of
+
+
+def _warm(whole: Whole, warm: Any) -> tuple[Tensor, Tensor]:
+    """States and controls of an earlier solution of such phases."""
+    if not isinstance(warm, PhasesSolution):
+        raise InputError("warm", "a PhasesSolution, or None", type(warm).__name__)
+    form = lambda of: (of.spans, of.spans_between, of.problem.row_shapes, of.problem.B)
+    if form(warm.whole) != form(whole):
+        raise InputError("warm", "a solution of phases of the same stages, states, controls and rows", repr(warm))
+    return warm.found.X, warm.found.U

@@ -1,0 +1,93 @@
+"""plot, animate and show: pictures of solutions, whose libraries are loaded when one is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from torchgco.base.errors import InputError
+from torchgco.fleets import Fleet, FleetSolution
+from torchgco.problem.problem import Problem, current_problem
+from torchgco.solution import Solution
+
+if TYPE_CHECKING:
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.figure import Figure
+
+    from torchgco.base.html import HtmlPage
+
+
+def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | Sequence[int] | None = None) -> Figure:
+    """The scene with the trajectories, then states and controls over time, with their bounds dashed.
+
+    Of a fleet a colour for each vehicle, with squares where they start and stars at their goals, then how far each is
+    from the nearest other one.
+
+    In space obstacles are cut at the height, in the side view at the y, that the first trajectory has there; crosses
+    mark contact, between the knots too. Bounds far from all values are left out. A notebook shows the figure;
+    `figure.savefig("name.pdf")` writes it.
+
+    Args:
+        problem, solution: as solved.
+        b: the place of a problem in the batch, or several; None: the first six. Those with the same obstacles and goal
+            share a scene. Of a fleet one place; None: the first.
+
+    Raises:
+        InputError: a place that isn't there, or a solution of other problems.
+    """
+    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
+        return _fleet_figure(problem, solution, b)
+    problem = current_problem(problem)
+    from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
+
+    return solution_figure(problem, solution.detach(), b)
+
+
+def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
+    from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
+
+    _fleet_of(fleet, solution)
+    members, X, U, distances = solution.arrays()
+    return fleet_figure(members, X, U, distances, b)
+
+
+def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[Solution]]:
+    if not isinstance(fleet, Fleet) or not isinstance(solution, FleetSolution) or len(solution) != fleet.V:
+        raise InputError("solution", "a fleet and its solution", type(solution).__name__)
+    return fleet.members, solution.vehicles
+
+
+def animate(problem: Problem, solution: Solution, b: int | Sequence[int] = 0) -> FuncAnimation:
+    """A film of trajectories among obstacles, also those that move, at 20 pictures a second in real time.
+
+    A notebook plays it; `.save("way.gif")` writes it, and where ffmpeg is installed `.save("way.mp4")`. In space from
+    above and from the side. Flights of over 12 s are shown faster.
+
+    Args:
+        problem, solution: as solved.
+        b: the place of a problem in the batch, or several among the same obstacles.
+
+    Raises:
+        InputError: a place that isn't there, a solution of other problems, other obstacles, or dynamics without a
+            position in 2-D or 3-D.
+    """
+    problem = current_problem(problem)
+    from torchgco.plotting.animated import solution_film  # matplotlib takes a second to load
+
+    return solution_film(problem, solution.detach(), b)
+
+
+def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPage:
+    """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
+
+    Of fleets with a colour for each vehicle.
+
+    Raises:
+        InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
+    """
+    from torchgco.view import notebook  # slow to load
+
+    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
+        return notebook.show_fleet(*_fleet_of(problem, solution))
+    problem = current_problem(problem)
+    return notebook.show(problem, solution.detach())

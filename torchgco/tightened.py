@@ -1,0 +1,37 @@
+"""Problems whose rows within stages keep a little more distance: a second solve is denser than the first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from torchgco.base.errors import InputError
+from torchgco.problem.in_time import at_times
+from torchgco.problem.problem import Problem, current_problem
+from torchgco.solution import Solution
+
+
+def tightened(problem: Problem, solution: Solution) -> Problem:
+    """The problem whose `BetweenKnots` rows are tightened by the excess of a solution between their points.
+
+        solution = torchgco.solve(problem)
+        for _ in range(2):
+            problem = torchgco.tightened(problem, solution)
+            solution = torchgco.solve(problem, warm=solution)
+
+    Per problem, stage and row 1.05 times the largest violation at 20 instants of the stage is added to what was
+    before. The rows' multipliers are those of the tightened rows; `judge` of the first problem tells what is left.
+
+    Raises:
+        InputError: no `BetweenKnots` in the problem; a solution of another form.
+    """
+    problem = current_problem(problem)
+    problem.check_controls(solution.U, "solution.U")
+    whole, X, U = at_times(problem, solution.X, solution.U, solution.t if problem.time is not None else None)
+    rows: list[Any] = list(problem.constraints)
+    within = [i for i, row in enumerate(rows) if row.tightened is not None]
+    if not within:
+        raise InputError("problem", "one with BetweenKnots", "none among its constraints")
+    for i in within:
+        rows[i] = rows[i].tightened(whole.constraints[i].bare, X, U)
+    return replace(problem, constraints=rows)
