@@ -17,7 +17,8 @@ def violation_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     Of trajectories X (B, N+1, n), U (B, N, m), by the model's own integrator. A stage counts for a row that holds at
     its last knot, and at its first; where this is the given start, at the knot after. Rows that hold along the way
-    anyway, such as distances, and a required goal don't count. NaN where rows would count, but the model doesn't integrate a field.
+    anyway, such as distances, and a required goal don't count. NaN where rows would count, but the model doesn't
+    integrate a field.
     """
     worst = torch.zeros_like(X[:, 0, 0])
     counted = path_rows(problem)
