@@ -20,7 +20,8 @@ def tightened(problem: Problem, solution: Solution) -> Problem:
             solution = torchgco.solve(problem, warm=solution)
 
     Per problem, stage and row 1.05 times the largest violation at 15 instants between two points is added to what was
-    before at both. The rows' multipliers are those of the tightened rows; `judge` of the first problem tells what is left.
+    before at both. The rows' multipliers are those of the tightened rows; `judge` of the first problem tells what is
+    left.
 
     Raises:
         InputError: no `BetweenKnots` in the problem; a solution of another form.
