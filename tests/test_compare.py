@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 import torchgco
 from tests.problems import planar_batch
-from torchgco import InputError, presets
+from torchgco import ControlBounds, FunctionCost, FunctionDynamics, InputError, Problem, Spheres, presets
 
 
 def test_each_row_is_that_of_a_solve_alone() -> None:
@@ -33,3 +34,16 @@ def test_solvers_have_names_of_their_own() -> None:
             torchgco.compare(problem, wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="solver: expected one of gco"):
         torchgco.compare(problem, ["nothing"])
+
+
+def test_a_trajectory_through_an_obstacle_is_no_best_one() -> None:
+    """Its knots lie before and behind the ball: what stays clear had a ratio of 301 to it."""
+    model = FunctionDynamics(lambda x, u: u, 2, 2, 1.0, "rk4", position=slice(0, 2))
+    end = torch.tensor([4.0, 0.0]).double()
+    cost = FunctionCost(lambda x, u: 0.1 * u.square().sum(-1), lambda x: 10.0 * (x - end).square().sum(-1))
+    rows, x0 = [Spheres([[2.0, 0.02]], [0.35]), ControlBounds(-3.0, 3.0)], torch.zeros(1, 2).double()
+    problem = Problem(model, cost, rows, x0, 3)
+    with pytest.warns(torchgco.ContactWarning):
+        table = torchgco.compare(problem, ["al_ilqr", "hold"])
+    assert table["cost"].iloc[0] < table["cost"].iloc[1] and (table["clearance"] < 0).tolist() == [True, False]
+    assert np.isnan(table["cost_ratio"].iloc[0]) and table["cost_ratio"].iloc[1] == 1.0

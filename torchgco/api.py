@@ -22,11 +22,15 @@ from torchgco.constraints.norms import within_norms
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.solve import solve_fleet
 from torchgco.guesses import Guess, guesses_of, solve_guesses
+from torchgco.judging.judge import judge
 from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
+<<<<<<< HEAD
 from torchgco.obstacles.base import ADMITTED
 from torchgco.phases import Phases, PhasesSolution
 from torchgco.phases.solve import solve_phases
+=======
+>>>>>>> reading2
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import guessing_times
@@ -37,7 +41,7 @@ from torchgco.sensitivity import asks_for_gradients, attached, check_smoothing
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Solver
 from torchgco.solvers.watching import Watcher
-from torchgco.warned import warn_of
+from torchgco.warned import CLAIMS, warn_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -240,8 +244,8 @@ def compare(
     Returns:
         A row per solver and problem, with index `solver` and `element`: the columns of `Solution.to_frame(problem)`;
         `cost_ratio` to the cheapest trajectory of the problem that is as good (its goal reached, where that is judged,
-        else its constraints kept), NaN for those that aren't; `seconds` per problem, those of the whole solve divided
-        by B, without compiling.
+        else feasible), NaN for those that aren't, and where the least cost isn't above 0; `seconds` per problem, those
+        of the whole solve divided by B, without compiling.
 
     Raises:
         InputError: as `solve`; no solver, or two of the same name.
@@ -251,7 +255,7 @@ def compare(
     check_untransformed("compare")
     problem = current_problem(problem)
     made = _named_solvers(problem, solvers)
-    frames = []
+    frames, feasible = [], []
     for name, solver in made.items():
         prepared = solver.prepare(problem)
         began = clock.seconds()
@@ -261,8 +265,9 @@ def compare(
             torch.cuda.synchronize(problem.x0.device)
         seconds = (clock.seconds() - began) / max(1, problem.B)
         frames.append(_judged_frame(problem, found).assign(solver=name, seconds=seconds).reset_index())
+        feasible.append(_feasible(problem, found).cpu())
     table = pd.concat(frames, ignore_index=True)
-    good = table["reached"] if "reached" in table else table["violation"] <= ADMITTED
+    good = table["reached"] if "reached" in table else pd.Series(torch.cat(feasible).numpy())
     cost = table["cost"].where(good.astype(bool))
     best = cost.groupby(table["element"]).transform("min")
     table.insert(table.columns.get_loc("cost") + 1, "cost_ratio", (cost / best).where(best > 0))
@@ -289,6 +294,15 @@ def _judged_frame(problem: Problem, solution: Solution) -> pd.DataFrame:
         return solution.to_frame(problem)
     except InputError:  # obstacles of a kind that can't be judged
         return solution.to_frame()
+
+
+def _feasible(problem: Problem, solution: Solution) -> Tensor:
+    """Which trajectories are feasible between the knots, too, and through every gate, (B,) bool."""
+    start = None if problem.free_start is None else solution.X[:, 0]
+    try:
+        return judge(problem, solution.U, start=start, times=solution.times).feasible
+    except InputError:  # as above
+        return torch.isin(solution.status, torch.tensor(CLAIMS, device=solution.status.device))
 
 
 def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:

@@ -19,15 +19,16 @@ def tightened(problem: Problem, solution: Solution) -> Problem:
             problem = torchgco.tightened(problem, solution)
             solution = torchgco.solve(problem, warm=solution)
 
-    Per problem, stage and row 1.05 times the largest violation at 20 instants of the stage is added to what was
-    before. The rows' multipliers are those of the tightened rows; `judge` of the first problem tells what is left.
+    Per problem, stage and row 1.05 times the largest violation at 15 instants between two points is added to what was
+    before at both. The rows' multipliers are those of the tightened rows; `judge` of the first problem tells what is
+    left.
 
     Raises:
         InputError: no `BetweenKnots` in the problem; a solution of another form.
     """
     problem = current_problem(problem)
     problem.check_controls(solution.U, "solution.U")
-    whole, X, U = at_times(problem, solution.X, solution.U, solution.t if problem.time is not None else None)
+    whole, X, U = at_times(problem, solution.X, solution.U, solution.times)
     rows: list[Any] = list(problem.constraints)
     within = [i for i, row in enumerate(rows) if row.tightened is not None]
     if not within:

@@ -16,6 +16,7 @@ from torchgco import (
     FreeTime,
     FunctionConstraint,
     FunctionDynamics,
+    InteriorPoint,
     NormBounds,
     Problem,
     QuadraticCost,
@@ -204,3 +205,12 @@ def test_what_cannot_be_tightened_is_told() -> None:
     other, _ = half_a_turn(BetweenKnots(RING[0]), N=6)
     with pytest.raises(InputError, match=r"solution\.U"):
         torchgco.tightened(other, solution)
+
+
+def test_a_solution_in_free_time_is_none_of_a_fixed_problem() -> None:
+    """Its states and controls lead elsewhere by steps of dt: a row was tightened by 380 times its bound."""
+    problem, _ = half_a_turn(BetweenKnots(RING[0]))
+    free = replace(problem, time=FreeTime(0.5, 3.0))
+    solution = torchgco.solve(free, solver=InteriorPoint(max_iterations=3), verbose=False)
+    with pytest.raises(InputError, match="times"):
+        torchgco.tightened(problem, solution)

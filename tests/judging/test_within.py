@@ -13,6 +13,7 @@ import torchgco
 from torchgco import (
     BetweenKnots,
     ControlBounds,
+    FreeTime,
     FunctionConstraint,
     FunctionDynamics,
     Goal,
@@ -20,6 +21,7 @@ from torchgco import (
     NormBounds,
     Problem,
     QuadraticCost,
+    QuadrotorPlant,
     Spheres,
     StateBounds,
 )
@@ -63,6 +65,8 @@ def test_knots_say_which_stages_count() -> None:
     row = lambda x: x[..., 1:] - 0.5
     assert float(judged(FunctionConstraint(row, knots=[-1])).max()) == 0.0
     assert float(judged(FunctionConstraint(row, knots=[3, 5, 9])).max()) == 0.0
+    assert float(judged(FunctionConstraint(row, knots=[1, 5])).max()) == 0.0
+    assert float(judged(FunctionConstraint(lambda x, u: row(x), of="xu", knots=[2, N - 1])).max()) == 0.0
     parts = [judged(FunctionConstraint(row, knots=knots)) for knots in (range(1, 5), range(4, N + 1))]
     assert torch.equal(torch.maximum(*parts), judged(FunctionConstraint(row)))
 
@@ -74,6 +78,25 @@ def test_what_is_kept_on_its_way_does_not_count() -> None:
     point = replace(SWING, position=slice(0, 1))
     problem = Problem(point, COST, [Spheres([[5.0]], [0.1])], X0, N, Goal([0.0], 0.1, required=True))
     assert float(torchgco.judge(problem, problem.at_rest[1]).violation_between.max()) == 0.0
+
+
+def test_the_ball_of_a_goal_is_of_the_end_even_of_a_single_stage() -> None:
+    point = replace(SWING, position=slice(0, 1))
+    problem = Problem(point, COST, [], X0, 1, Goal([0.9], 0.05, required=True))
+    assert float(torchgco.judge(problem, problem.at_rest[1]).violation_between.max()) == 0.0
+
+
+@pytest.mark.parametrize("time", [None, FreeTime(0.3, 1.0)])
+def test_states_within_stages_are_settled_as_those_at_knots(time: FreeTime | None) -> None:
+    """Rotors at full thrust, called to turn faster still: their steps end within the limit, and so do shorter ones."""
+    model, free = QuadrotorPlant(dt=0.05), [torch.inf] * 13
+    full = [model.airframe.thrust_max] * 4
+    x0 = torch.tensor([[0.0] * 6 + [1.0] + [0.0] * 6 + full]).double()
+    cost, rows = QuadraticCost([1.0] * 17, [1e-9] * 4, [1.0] * 17), [StateBounds([-torch.inf] * 17, free + full)]
+    problem = Problem(model, cost, rows, x0, 3, time=time)
+    times = None if time is None else 0.05 * torch.arange(4.0, dtype=torch.float64)[None]
+    verdict = torchgco.judge(problem, torch.full((1, 3, 4), 6e4, dtype=torch.float64), times=times)
+    assert float(verdict.violation) == float(verdict.violation_between) == 0.0
 
 
 def test_horizons_end_the_stages_and_maps_have_none() -> None:

@@ -10,6 +10,7 @@ import torch
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import GuidanceWarning, InputError
 from torchgco.base.options import Count, Positive
+from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
 from torchgco.guidance.mppi import MPPI
 from torchgco.guidance.suitability import suited_sampler
@@ -25,7 +26,7 @@ class IteratedMPPI(Solver, named="solver"):
     """Algorithm 3 repeated, each time around its last mean; the best iterate is kept.
 
     Feasible before infeasible; of feasible iterates the cheapest, of infeasible ones the least violated. The initial
-    guess doesn't count.
+    guess doesn't count. A limit of time is looked at after each repetition.
 
     Args:
         sampler: draws and weighs the samples.
@@ -54,11 +55,16 @@ class IteratedMPPI(Solver, named="solver"):
             warnings.warn(lost, GuidanceWarning, stacklevel=2)
         U = best = call.U0
         best_cost = best_violation = torch.full_like(problem.x0[:, 0], torch.inf)
-        for i in range(self.iterations):
-            X, U = sampler.improve(problem, U, DrawKey(call.seed, ids, torch.full_like(ids, i)))
+        done = 0
+        while done < self.iterations and not (done and call.late):
+            X, U = sampler.improve(problem, U, DrawKey(call.seed, ids, torch.full_like(ids, done)))
             cost, worst = problem.cost.total(X, U), measured(problem, X, U)
             better = is_better(cost, worst, best_cost, best_violation, self.violation_tolerance)
             best = torch.where(better.view(-1, 1, 1), U, best)
             best_cost = torch.where(better, cost, best_cost)
             best_violation = torch.where(better, worst, best_violation)
-        return rolled_out(problem, best, self.violation_tolerance, self.iterations)
+            done += 1
+        solution = rolled_out(problem, best, self.violation_tolerance, done)
+        if done < self.iterations:
+            solution.status[solution.status == Status.INFEASIBLE] = Status.TIME_LIMIT
+        return solution

@@ -16,8 +16,9 @@ def violation_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """The largest violation (B,) of inequalities of the state within stages, at 20 instants of each.
 
     Of trajectories X (B, N+1, n), U (B, N, m), by the model's own integrator. A stage counts for a row that holds at
-    its last knot, and at its first, unless this is the given start; rows that hold along the way anyway, such as
-    distances, don't count. NaN where rows would count, but the model doesn't integrate a field.
+    its last knot, and at its first; where this is the given start, at the knot after. Rows that hold along the way
+    anyway, such as distances, and a required goal don't count. NaN where rows would count, but the model doesn't
+    integrate a field.
     """
     worst = torch.zeros_like(X[:, 0, 0])
     counted = path_rows(problem)
@@ -42,7 +43,9 @@ def path_rows(problem: Problem) -> list[tuple[Constraint, list[int], list[int]]]
 
 def _is_of_path(row: Constraint) -> bool:
     is_of_controls = getattr(row.bare, "of", "x") == "u"
-    return row.sense == "inequality" and not (row.joins_knots or row.bare.on_its_way or is_of_controls)
+    return row.sense == "inequality" and not (
+        row.joins_knots or row.bare.on_its_way or row.bare.is_goal or is_of_controls
+    )
 
 
 def _reads_controls(row: Constraint, N: int) -> bool:
@@ -53,7 +56,7 @@ def _stages(row: Constraint, N: int) -> tuple[list[int], list[int]]:
     """Where among a row's knots those of the stages are through which it holds, and which stages these are."""
     knots = list(range(N + 1)[row.knots]) if isinstance(row.knots, slice) else row.knots.tolist()
     if _reads_controls(row, N):
-        pairs = [(i, k) for i, k in enumerate(knots) if k == N - 1 or k + 1 in knots]
+        pairs = [(i, k) for i, k in enumerate(knots) if k + 1 in knots or (k == N - 1 and (N == 1 or k - 1 in knots))]
     else:
-        pairs = [(i, k - 1) for i, k in enumerate(knots) if k == 1 or k - 1 in knots]
+        pairs = [(i, k - 1) for i, k in enumerate(knots) if k - 1 in knots or (k == 1 and (N == 1 or 2 in knots))]
     return [i for i, _ in pairs], [k for _, k in pairs]

@@ -38,7 +38,8 @@ def between(dynamics: Dynamics, X: Tensor, U: Tensor, k: Tensor, h: Tensor, leng
     if not model.stretches:
         return x + (h / lengths).unsqueeze(-1) * (X[:, k + 1] - x)
     # The field times h, over a unit of time: integrators take one time step for all states.
-    return INTEGRATORS[model.integrator](lambda z: h.unsqueeze(-1) * model.field(z, u), x, 1.0)
+    x = INTEGRATORS[model.integrator](lambda z: h.unsqueeze(-1) * model.field(z, u), x, 1.0)
+    return x if model.is_integrated else model.settled(x)  # as its own steps are
 
 
 def bends(problem: Problem) -> bool:

@@ -229,6 +229,10 @@ class _Dynamics(WrappedDynamics):
         rates = x[..., n : n + 1] * model.field(model.settled(x[..., :n]), u[..., : model.m])
         return torch.cat((rates, torch.zeros_like(x[..., n:])), dim=-1)
 
+    def settled(self, x: Tensor) -> Tensor:
+        n = self.model.n
+        return torch.cat((self.model.settled(x[..., :n]), x[..., n:]), dim=-1)
+
     def step(self, x: Tensor, u: Tensor) -> Tensor:
         n, m, model = self.model.n, self.model.m, self.model
         tau, v = x[..., n : n + 1], u[..., :m]
