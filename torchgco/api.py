@@ -25,12 +25,8 @@ from torchgco.guesses import Guess, guesses_of, solve_guesses
 from torchgco.judging.judge import judge
 from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
-<<<<<<< HEAD
-from torchgco.obstacles.base import ADMITTED
 from torchgco.phases import Phases, PhasesSolution
 from torchgco.phases.solve import solve_phases
-=======
->>>>>>> reading2
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import guessing_times
