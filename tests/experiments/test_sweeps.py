@@ -276,12 +276,13 @@ def test_a_layout_digest_depends_only_on_what_is_flown() -> None:
 
 BOXED = {"box_centers": np.zeros((2, 1, 2)), "box_half_sizes": np.ones((2, 1, 2))}
 SWINGING = BOXED | dict.fromkeys(("box_amplitudes", "box_rates", "box_phases"), np.ones((2, 1, 1, 2)))
+FLEET = {"start": np.ones((2, 2, 2)), "goal": np.zeros((2, 2, 2)), "apart": 0.4}
 GATED = {"gate_centers": np.ones((2, 1, 2)), "gate_radii": np.ones((2, 1))}
 OTHERS = {
     "vehicle_radius": 0.2, "goal_radius": 0.3, "dt": 0.1, "stages": 6, "control_lower": [-1.0], "control_upper": [1.0],
     "start": np.ones(2), "goal": np.zeros(2), "velocities": np.ones((2, 2, 2)), "centers": scene().centers + 1.0,
     "radii": np.array([[0.3, np.nan], [0.3, 0.3]]), "box_radii": np.ones((2, 1)), "box_rotations": np.ones((2, 1)),
-    "free_time": [0.5, 2.0, 1.0], "goal_required": True,
+    "free_time": [0.5, 2.0, 1.0], "goal_required": True, "apart": 0.5,
     "map": DistanceField.of(OccupancyGrid(np.eye(3, dtype=bool), [0.0, 0.0], 0.1)),
     **{name: value + 1.0 for name, value in (SWINGING | GATED).items()},
 }  # fmt: skip
@@ -301,7 +302,8 @@ def test_boxes_make_another_layout_unless_absent() -> None:
 @pytest.mark.parametrize("field", sorted({f.name for f in fields(Layouts)} - OF_NO_FLIGHT))
 def test_every_input_of_a_flight_changes_the_digest(field: str) -> None:
     boxes = field in ("box_radii", "box_rotations")
-    plain = scene(**next((group for group in (BOXED, SWINGING, GATED) if field in group or boxes), {}))
+    groups = (FLEET,) if field == "apart" else (BOXED, SWINGING, GATED)
+    plain = scene(**next((group for group in groups if field in group or boxes), {}))
     one, other = layout_digests(plain, PLANE), layout_digests(replace(plain, **{field: OTHERS[field]}), PLANE)
     assert not set(one.values()) & set(other.values())
 

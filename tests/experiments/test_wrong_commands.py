@@ -50,7 +50,7 @@ WRONG = {
     "new mission key": ([*MISSION, "+mission.foo=1"], "mission.foo: expected an option that SensorMission has"),
     "new planner key": ([*MISSION, "+mission.planner.foo=1"], "mission.planner.foo: expected an option that Planner"),
     "new key": (["+foo=1"], "foo: expected one of the keys seed, study, model"),
-    "no experiment": (["experiment=nope"], "experiment: expected one of feasibility, mission"),
+    "no experiment": (["experiment=nope"], "experiment: expected one of feasibility, fleet, mission"),
     "plant alone": (["plant=rotors"], "plant: expected a mission"),
     "null plant": (["mission=default", "plant=null"], "plant: expected the vehicle that flies the mission"),
     "twice": (["seed=1", "seed=2"], "seed: expected one value, got seed=1 and seed=2"),

@@ -10,7 +10,7 @@ import torch
 
 from torchgco import FunctionCost, FunctionDynamics, Problem
 from torchgco.native.codegen.cost import spans_of_cost
-from torchgco.native.codegen.knot import _one_knot
+from torchgco.native.codegen.knot import _knots
 
 
 def problem(N: int) -> Problem:
@@ -32,7 +32,7 @@ def test_a_knot_reads_its_own_numbers_alone(N: int, monkeypatch: pytest.MonkeyPa
 
     span = spans_of_cost(problem(N))[0]
     monkeypatch.setattr(casadi, "Function", noted)
-    knot, places = _one_knot(span)
+    (knot,), places = _knots(span)
     assert knot.numbers.numel() == 3 and len({tuple(place) for place in places}) == N
     assert len({at for place in places for at in place}) == 3 * N
     assert len(made) >= N and max(function.nnz_in() for function in made) <= 9
