@@ -99,7 +99,7 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor, costate
     better = "a smaller dt"
     if bool(found.of_cost[long].all()):
         told = (
-            f"Euler's steps change the costs of {count} by over 1 %: of problem {int(rows[b])} by about "
+            f"Euler's steps change the costs of {count} by over 1 %: of problem {int(rows[b])} by "
             f"{found.cost_told(b, 2.0)}"
         )
         better = f'integrator="{"rk4" if part.dynamics.integrator == "euler" else "radau5"}", or a smaller dt,'
