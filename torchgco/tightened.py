@@ -19,9 +19,9 @@ def tightened(problem: Problem, solution: Solution) -> Problem:
             problem = torchgco.tightened(problem, solution)
             solution = torchgco.solve(problem, warm=solution)
 
-    Per problem, stage and row 1.05 times the largest violation at 15 instants between two points is added to what was
-    before at both. The rows' multipliers are those of the tightened rows; `judge` of the first problem tells what is
-    left.
+    Between two points a row's largest violation is measured at 15 instants; it has to fall 1.05 times as far at both
+    points from where it is now, and further beside a knot. The first time compiles another form. The rows' multipliers
+    are those of the tightened rows; `judge` of the first problem tells what is left.
 
     Raises:
         InputError: no `BetweenKnots` in the problem; a solution of another form.

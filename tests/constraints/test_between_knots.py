@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -214,3 +215,10 @@ def test_a_solution_in_free_time_is_none_of_a_fixed_problem() -> None:
     solution = torchgco.solve(free, solver=InteriorPoint(max_iterations=3), verbose=False)
     with pytest.raises(InputError, match="times"):
         torchgco.tightened(problem, solution)
+
+
+@pytest.mark.parametrize("fault", [lambda x: x[..., :1] @ torch.ones(3, 2), lambda x: 1 / 0])
+def test_rows_that_fail_are_told_as_others_are(fault: Any) -> None:
+    for row in (FunctionConstraint(fault), BetweenKnots(FunctionConstraint(fault))):
+        with pytest.raises(InputError, match="constraint"):
+            half_a_turn(row)

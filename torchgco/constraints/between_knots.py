@@ -46,7 +46,7 @@ class BetweenKnots(Constraint):
     points: int = 3
     model: Any = field(default=None, repr=False, kw_only=True)  # the problem's, once bound, as what follows
     stages: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,)
-    margins: Any = field(default=None, repr=False, kw_only=True)  # (B, K, points, p): see `tightened`
+    margins: Any = field(default=None, repr=False, kw_only=True)  # (B, K, points, p), once tightened
     counted: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,): which of the constraint's knots end them
     factor: int | None = field(default=None, repr=False, kw_only=True)  # the state that is the factor of free time
 
@@ -78,15 +78,13 @@ class BetweenKnots(Constraint):
             )
         stages = torch.arange(dims.N + 1, device=dims.like.device)[own.knots] - (0 if _of_stages(own) else 1)
         counted = (stages >= 0).nonzero().flatten()
-        at_rest = dims.like.unsqueeze(1).expand(-1, dims.N + 1, -1), dims.like.new_zeros(dims.B, dims.N, dims.m)
-        margins = dims.like.new_zeros(dims.B, len(counted), self.points, own.value(*at_rest).shape[-1])
-        return replace(self, constraint=own, model=dims.model, stages=stages[counted], counted=counted, margins=margins)
+        return replace(self, constraint=own, model=dims.model, stages=stages[counted], counted=counted)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         """c (B, K, points p) of the stages, a point after the other."""
         shares = [i / (self.points + 1) for i in range(1, self.points + 1)]
-        rows = [self._rows(X, U, share) + self.margins[..., i, :] for i, share in enumerate(shares)]
-        return torch.cat(rows, dim=-1)
+        rows = torch.stack([self._rows(X, U, share) for share in shares], -2)
+        return (rows if self.margins is None else rows + self.margins).flatten(-2)
 
     def _rows(self, X: Tensor, U: Tensor, share: float) -> Tensor:
         """c (B, K, p) after this share of each stage."""
@@ -118,7 +116,8 @@ class BetweenKnots(Constraint):
         lever[:, :, 0], lever[:, :, -1] = levers[place[:, :, 0]], 1.0 - levers[place[:, :, -1]]
         excess = excess.clamp(min=0.0) / lever
         falls = torch.maximum(excess[:, :, :-1], excess[:, :, 1:])
-        return replace(self, margins=torch.where(falls > 0, MORE * falls - now, self.margins).clamp(min=0.0))
+        before = torch.zeros_like(now) if self.margins is None else self.margins
+        return replace(self, margins=torch.where(falls > 0, MORE * falls - now, before).clamp(min=0.0))
 
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
         return replace(self, factor=n)

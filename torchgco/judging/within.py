@@ -9,7 +9,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.problem.between import states_within
 from torchgco.problem.problem import Problem
 
-POINTS = 20  # of each stage: a row that bends by e over a stage is up to e / 880 larger between two of them
+POINTS = 20  # of each stage: a parabola that rises by e within it is at most e / 441 higher between two of them
 
 
 def violation_between(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ class Film(FuncAnimation):
 def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) -> Film:
     """The film of `torchgco.animate`; see there."""
     problem = current_problem(problem)
-    courses, _ = courses_of(problem, solution, b)
+    courses, unit = courses_of(problem, solution, b)
     position = problem.dynamics.position
     planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start)
     if planes is None:
@@ -74,7 +74,7 @@ def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) 
     def show(t: float) -> list[Artist]:
         while shown:
             shown.pop().remove()
-        title.set_text(f"{t:.1f} s")
+        title.set_text(f"{t:.1f} s" if unit != "knot" else f"knot {t:.1f}")
         nominal = scene.world.first.dt * float(np.interp(t, courses[0].t, np.arange(len(courses[0].t))))
         for ax, plane in zip(figure.axes, planes, strict=True):
             shown.extend(_moving(ax, scene.world, plane, nominal))
@@ -122,6 +122,8 @@ def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float) -> 
             drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
     if world.body is not None:
         state = course.X[int(past.sum()) - 1 : int(past.sum())]
+        if not np.isfinite(state).all():
+            return drawn
         look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}
         drawn += [ax.add_patch(Polygon(outline, **look)) for outline in silhouettes(world.body, state, plane)]
     return drawn
