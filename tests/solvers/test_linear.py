@@ -85,3 +85,44 @@ def test_in_pytorch_alike() -> None:
             use_native(True)
     for first, second in counts.values():
         assert bool(((first - second).abs() <= 1).all())
+
+
+def drawn_programme(seed: int, n: int = 2, m: int = 2, p: int = 2, N: int = 12) -> tuple[Problem, int]:
+    """One with mixed rows and controls that half the time have no bound, and HiGHS's status: 0 optimal, 3 unbounded."""
+    draw = np.random.default_rng(seed)
+    A, B, x0 = np.eye(n) + 0.3 * draw.normal(size=(n, n)), draw.normal(size=(n, m)), draw.normal(size=n)
+    by_x, by_u, at_end = draw.normal(size=n), draw.normal(size=m), draw.normal(size=n)
+    G, H = draw.normal(size=(p, n)), draw.normal(size=(p, m))
+    h = 1.0 + draw.random(p) + np.abs(G) @ np.abs(x0)
+    bounded = draw.random((2, m)) < 0.6
+    bounded[0, 0] = True
+    ends = np.where(bounded, [[-1.0], [1.0]] * np.ones(m), [[-np.inf], [np.inf]])
+
+    # In the variables x_1..x_N, u_0..u_N-1.
+    steps = np.c_[np.eye(N * n) - np.kron(np.eye(N, k=-1), A), -np.kron(np.eye(N), B)]
+    rows = np.c_[np.kron(np.eye(N, k=-1), G), np.kron(np.eye(N), H)]
+    first = np.r_[A @ x0, np.zeros((N - 1) * n)], np.tile(h, N) - np.r_[G @ x0, np.zeros((N - 1) * p)]
+    cost = np.r_[np.tile(by_x, N - 1), at_end, np.tile(by_u, N)]
+    bounds = [(None, None)] * (N * n) + list(zip(*np.tile(ends, N), strict=True))
+    status = linprog(cost, rows, first[1], steps, first[0], bounds, method="highs").status
+
+    A, B, G, H, h, by_x, by_u, at_end = map(torch.tensor, (A, B, G, H, h, by_x, by_u, at_end))
+    model = FunctionDynamics(lambda x, u: x @ A.T + u @ B.T, n, m, dt=1.0, integrator="none")
+    value = FunctionCost(lambda x, u: (x * by_x).sum(-1) + (u * by_u).sum(-1), lambda x: (x * at_end).sum(-1))
+    row = FunctionConstraint(lambda x, u: x @ G.T + u @ H.T - h, of="xu")
+    return Problem(model, value, [row, ControlBounds(*torch.tensor(ends))], torch.tensor(x0)[None], N), status
+
+
+@pytest.mark.parametrize("seeds", mostly([range(20), range(20, 80)], range(20)), ids=str)
+def test_programmes_without_an_end(seeds: range) -> None:
+    """What HiGHS calls unbounded is never said to be feasible, and most is told; what has an optimum isn't."""
+    told = []
+    for seed in seeds:
+        problem, status = drawn_programme(seed)
+        found = InteriorPoint().solve(problem, problem.x0.new_zeros(1, problem.N, problem.m)).statuses[0]
+        if status == 3:
+            assert found not in (Status.CONVERGED, Status.FEASIBLE), seed
+            told.append(found == Status.UNBOUNDED)
+        else:
+            assert found != Status.UNBOUNDED, seed
+    assert len(told) >= 5 and sum(told) >= 0.7 * len(told), told

@@ -130,31 +130,30 @@ def drawn_guesses() -> Tensor:
 # Poles ----------------------------------------------------------------------------------------------------------------
 
 
-def firm(power: float, *constraints: Constraint) -> Problem:
-    """Investment that costs its square over a power of the capital, which nothing keeps above 0, for drawn rates."""
+def firm(*constraints: Constraint) -> Problem:
+    """Investment that costs its square over the capital, which nothing keeps above 0, for drawn rates."""
     draws = torch.Generator().manual_seed(3)
     value = 0.15 + 0.1 * torch.rand(16, generator=draws, dtype=D)
     x0 = (0.5 + torch.rand(16, 1, generator=draws, dtype=D)).clone()
 
     def stage(x: Tensor, u: Tensor, k: Any, value: Tensor) -> Tensor:
         capital = x[..., 0]
-        return -(0.86**k) * (value * capital - u[..., 0] - (u[..., 0] - 0.1 * capital).square() / capital**power)
+        return -(0.86**k) * (value * capital - u[..., 0] - (u[..., 0] - 0.1 * capital).square() / capital)
 
     model = FunctionDynamics(lambda x, u: u - 0.1 * x, 1, 1, 1.0, "rk4")
     return Problem(model, FunctionCost(stage, values={"value": value}), constraints, x0, 60)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("power", mostly([1, 3], 3))
-def test_a_cost_that_falls_at_a_pole(solver: str, power: int) -> None:
-    found = torchgco.solve(firm(power), solver=solver)
+def test_a_cost_that_falls_at_a_pole(solver: str) -> None:
+    found = torchgco.solve(firm(), solver=solver)
     assert found.statuses.count(Status.UNBOUNDED) >= 12, found  # others end elsewhere, or no slope leads there
     assert found.statuses.count(Status.NOT_POSITIVE_DEFINITE) <= 2, found
 
 
 @pytest.mark.parametrize("solver", ["interior_point", "gco"])
 def test_a_pole_that_bounds_keep_away(solver: str) -> None:
-    found = torchgco.solve(firm(1, StateBounds(1e-3, INF)), solver=solver)
+    found = torchgco.solve(firm(StateBounds(1e-3, INF)), solver=solver)
     assert found.statuses == [Status.CONVERGED] * 16, found
 
 

@@ -27,7 +27,7 @@ from torchgco.solvers.ending import STATIONARY, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
-from torchgco.solvers.unbounded import beyond_rounding
+from torchgco.solvers.unbounded import ROUNDING, beyond_rounding
 
 REPORTED_AT_ONCE = 256  # problems between two reports of progress
 SADDLE_STEPS = 1e-3, 1e-1  # sizes of the controls, by which a solve goes on beside a saddle point or a maximum
@@ -192,7 +192,7 @@ class InteriorPoint(Solver, named="solver"):
         problem, best = call.problem, end.best
         X, cost, worst = guess.X, guess.cost, guess.violation
         lost = ~(torch.isfinite(best.cost) & torch.isfinite(best.violation))
-        violated = beyond_rounding(best.violation, best.U)
+        violated = beyond_rounding(problem.held_at(best.X[:, 0]), best.U, best.violation, ROUNDING)
         worse = is_better(cost, worst, best.cost, violated, self.admitted(problem)) | lost
         rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
         if rows.numel() > 0:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
+from torchgco.base.draws import uniform
 from torchgco.dynamics.rollout import open_loop as rolled_out
 from torchgco.kernels import cost_scale, cost_unit, measured, open_loop
 from torchgco.lagrangian.state import Iterate
@@ -17,14 +18,40 @@ DEEP_FALL = 1e6  # a fall that asks for a closer look
 BOTTOMLESS = 1e20  # one that needs none: IPOPT's diverging_iterates_tol
 FAR_CONTROLS = 1e6  # times 1 + the guess's own controls: a way of controls that asks for a look
 FARTHER = 10.0, 1e3, 1e6  # times the way from the guess, for that look
+ROUNDING = 1e-12  # share of a row's size that sums of hundreds of numbers lose
+LAST_DIGITS = 4.0  # times the largest control's: a control is the sum of some numbers of its size
+OF_A_RAY = 1e-7  # share by which the solver's directions may be off: the tolerance of HiGHS for its rays
+OTHERWISE, OTHERS = 1e-3, 2  # how much larger or smaller other controls are that show a row's size, and how many
 POLE_WAYS, POLE_PLACES, POLE_ROUNDS = (-8.0, 2.0), 41, 9  # powers of ten of the way, places tried, and how often
-GROWING = 1e-3  # controls that moved by less than this share of the largest move stay where they are
+GROWING = 1e-3, 1e-9  # controls that moved by less than such a share of the largest move stay where they are
 
 
-def beyond_rounding(violation: Tensor, U: Tensor) -> Tensor:
-    """Violations (B,), and 0 where the last digits of controls U (B, N, m) make as much: costs that fall go far."""
-    rounding = torch.finfo(U.dtype).eps * U.abs().flatten(1).amax(-1)
-    return torch.where(violation <= rounding, 0.0, violation)
+def beyond_rounding(problem: Problem, U: Tensor, violation: Tensor, share: float) -> Tensor:
+    """Violations (B,) of controls U (B, N, m), or where controls went far those of rows that aren't lost in their sums.
+
+    Where costs fall without end, a row is the difference of numbers that are many times as large. Their size follows
+    from what the row makes of other controls, each up to a thousandth larger or smaller: rows count that are violated
+    by more than a share of it, and by more than the last digits of the controls.
+    """
+    digits = LAST_DIGITS * torch.finfo(U.dtype).eps * U.abs().amax(dim=(1, 2), keepdim=True)
+    far_off = U.abs().flatten(1).amax(-1) >= FAR_CONTROLS
+    rows = (far_off & (violation > 0) & torch.isfinite(violation)).nonzero().flatten()
+    if rows.numel() == 0:
+        return violation
+    far, U, digits, counted = problem.take(rows), U[rows], digits[rows], torch.zeros_like(violation[rows])
+    X = open_loop(far, U)
+    others = [U * (1.0 + OTHERWISE * (2.0 * uniform(i, U.shape[1:], U) - 1.0)) for i in range(OTHERS)]
+    paths = [open_loop(far, V) for V in others]
+    for constraint in far.constraints:
+        value = constraint.value(X, U)
+        if value[0].numel() == 0:
+            continue
+        changes = [(constraint.value(path, V) - value).abs() for path, V in zip(paths, others, strict=True)]
+        size = torch.stack(changes).amax(0) / OTHERWISE
+        violated = constraint.violation(X, U)
+        beyond = torch.where((value.abs() <= share * size) | (violated <= digits), 0.0, violated)
+        counted = torch.maximum(counted, beyond.flatten(1).amax(-1))
+    return violation.index_put((rows,), counted)
 
 
 def falls_without_end(problem: Problem, U0: Tensor, best: Iterate, left: Tensor, tolerance: float) -> Tensor:
@@ -38,21 +65,25 @@ def falls_without_end(problem: Problem, U0: Tensor, best: Iterate, left: Tensor,
     unit = problem.N * cost_unit(problem)
     way = (best.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
     open_ended = (left > STATIONARY) | (way >= FAR_CONTROLS)
-    falls = ((best.cost < -DEEP_FALL * unit) | open_ended) & (beyond_rounding(best.violation, best.U) <= tolerance)
+    violated = beyond_rounding(problem.held_at(best.X[:, 0]), best.U, best.violation, OF_A_RAY)
+    falls = ((best.cost < -DEEP_FALL * unit) | open_ended) & (violated <= tolerance)
     rows = falls.nonzero().flatten()
     if rows.numel() == 0:
         return falls
     X, U0, U, cost, unit = (z[rows] for z in (best.X, U0, best.U, best.cost, unit))
     fixed = problem.take(rows).held_at(X[:, 0])
     before = fixed.cost.total(open_loop(fixed, U0), U0)
-    farther, clear = _farther(fixed, U0, U, tolerance)
-    costs = torch.stack([cost, *farther])
-    fall, size, times = before - costs, before.abs() + unit, cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
-    linear = (fall >= 0.5 * times * fall[0]).all(0) & (fall[0] >= DEEP_FALL * size)
-    rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
-    without = (cost - cost_scale(fixed).constant).abs() + unit
-    by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
-    falls[rows] = (fall[0] >= BOTTOMLESS * size) | ((linear | by_decades) & clear)
+    fall, size, without = before - cost, before.abs() + unit, (cost - cost_scale(fixed).constant).abs() + unit
+    goes_on = fall >= BOTTOMLESS * size
+    times = cost.new_tensor([1.0, *FARTHER]).unsqueeze(-1)
+    for growing in GROWING:
+        costs, clear = _farther(fixed, U0, U, growing, tolerance)
+        costs = torch.cat([cost.unsqueeze(0), costs])
+        linear = (before - costs >= 0.5 * times * fall).all(0) & (fall >= DEEP_FALL * size)
+        rate = (costs[:-1] - costs[1:]) / times.log10().diff(dim=0)
+        by_decades = (rate >= 0.5 * rate[0]).all(0) & (rate[0] > STATIONARY * without) & open_ended[rows]
+        goes_on |= (linear | by_decades) & clear
+    falls[rows] = goes_on
     stuck = (torch.isinf(left[rows]) & ~falls[rows]).nonzero().flatten()
     if stuck.numel() > 0:  # no control Hessian was convex enough: the cost may fall without end at a pole
         falls[rows[stuck]] = _falls_at_a_pole(fixed.take(stuck), U[stuck], without[stuck], tolerance)
@@ -83,14 +114,14 @@ def _falls_at_a_pole(problem: Problem, U: Tensor, size: Tensor, tolerance: float
     return (later >= 0.5 * first) & (later > STATIONARY * size)
 
 
-def _farther(problem: Problem, U0: Tensor, U: Tensor, tolerance: float) -> tuple[list[Tensor], Tensor]:
-    """The costs (b,) at multiples of the way from U0 to U (b, N, m), and whether none of these places is violated."""
+def _farther(problem: Problem, U0: Tensor, U: Tensor, growing: float, tolerance: float) -> tuple[Tensor, Tensor]:
+    """The costs (F, b) at multiples of the way from U0 to U (b, N, m), and whether none of these places is violated."""
     move, clear = U - U0, torch.ones_like(U[:, 0, 0], dtype=torch.bool)
-    large = move.abs() >= GROWING * move.abs().flatten(1).amax(-1).view(-1, 1, 1)
+    large = move.abs() >= growing * move.abs().flatten(1).amax(-1).view(-1, 1, 1)
     costs = list[Tensor]()
     for times in FARTHER:
         beyond = U + torch.where(large, (times - 1) * move, 0.0)
         path = open_loop(problem, beyond)
         costs.append(problem.cost.total(path, beyond))
-        clear &= beyond_rounding(measured(problem, path, beyond), beyond) <= tolerance
-    return costs, clear
+        clear &= beyond_rounding(problem, beyond, measured(problem, path, beyond), OF_A_RAY) <= tolerance
+    return torch.stack(costs), clear
