@@ -44,27 +44,33 @@ def way_through(
     first, last = (np.clip(np.rint((s[0, :d] - low) / cell), 0, shape - 1) for s in (layout.start, layout.goal))
     first, last = tuple(first.astype(int)), tuple(last.astype(int))
 
-    def free(size: float, counts: np.ndarray, time: float) -> np.ndarray:
-        cells = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, d)
-        return (distances(layout, low + size * cells, time) >= float(layout.vehicle_radius or 0.0) + room).reshape(
-            counts
+    def free(size: float, counts: np.ndarray, time: float, ends: Sequence[np.ndarray]) -> np.ndarray:
+        """Which cells (counts) are, of those from one end to the other; none beside these."""
+        ranges = [np.arange(max(a, 0), min(b + 1, n)) for a, b, n in zip(*ends, counts, strict=True)]
+        cells, clear = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, d), np.zeros(counts, bool)
+        clear[tuple(cells.T)] = (
+            distances(layout, low + size * cells, time) >= float(layout.vehicle_radius or 0.0) + room
         )
+        return clear
 
     here = np.zeros(shape, bool)
-    here[first] = free(cell, shape, 0.0)[first]
+    here[first] = free(cell, shape, 0.0, [np.array(first)] * 2)[first]
     steps = list[tuple[np.ndarray, np.ndarray]]()  # what was reached before each, and what is free half-way
     for k in range(1, count + 1):
-        half = free(0.5 * cell, 2 * shape - 1, (k - 0.5) * step)
+        if not here.any():
+            return None
+        reached = np.argwhere(here)
+        ends = reached.min(axis=0), reached.max(axis=0)
+        half = free(0.5 * cell, 2 * shape - 1, (k - 0.5) * step, [2 * ends[0] - 1, 2 * ends[1] + 1])
         steps.append((here, half))
-        here = _reached(here, half, moves[:1] if k <= waits or k > count - waits else moves) & free(
-            cell, shape, k * step
-        )
+        here = _reached(here, half, moves[:1] if k <= waits or k > count - waits else moves)
+        here &= free(cell, shape, k * step, [ends[0] - 1, ends[1] + 1])
         if k > count - waits - 1:  # it has to be there by now
             at_goal = np.zeros(shape, bool)
             at_goal[last] = here[last]
             here = at_goal
-        if not here.any():
-            return None
+    if not here.any():
+        return None
     return Way(low + cell * _backwards(steps, last), step * np.arange(count + 1))
 
 
@@ -112,7 +118,10 @@ def distances(layout: Layouts, points: np.ndarray, t: float) -> np.ndarray:
         rounded = np.zeros(len(center)) if layout.box_radii is None else layout.box_radii[0]
         balls = (half == 0.0).all(axis=1)
         moved, radii = np.vstack([moved, center[balls]]), np.append(radii, rounded[balls])
-        off = np.abs(points[:, None] - center[~balls]) - half[~balls]
-        away = np.sqrt((np.maximum(off, 0.0) ** 2).sum(axis=-1)) + np.minimum(off.max(axis=-1), 0.0) - rounded[~balls]
+        squares, inmost = 0.0, np.float64(-np.inf)
+        for x, c, h in zip(points.T, center[~balls].T, half[~balls].T, strict=True):  # NumPy reduces short axes slowly
+            off = np.abs(x[:, None] - c) - h
+            squares, inmost = squares + np.maximum(off, 0.0) ** 2, np.maximum(inmost, off)
+        away = np.sqrt(squares) + np.minimum(inmost, 0.0) - rounded[~balls]
         least = away.min(axis=1, initial=np.inf)
     return np.minimum(least, (cdist(points, moved) - radii).min(axis=1, initial=np.inf))
