@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from functools import cache
@@ -92,11 +93,22 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(20_000, 20, 50)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Without a compiler: no tests of these folders, and no cases of native kernels (`native=True`) of others.
+    """Of the cases of a test marked `sampled(k)`, all but k, evenly among them, are slow.
+
+    Without a compiler: no tests of these folders, and no cases of native kernels (`native=True`) of others.
 
     Samples of nets in double precision are drawn in it there, which a warning says.
     """
+    sampled = defaultdict[str, list[pytest.Item]](list)
+    for item in items:
+        if item.get_closest_marker("sampled") is not None and item.get_closest_marker("slow") is None:
+            sampled[item.nodeid.partition("[")[0]].append(item)
+    for cases in sampled.values():
+        few = cases[0].get_closest_marker("sampled").args[0]  # type: ignore[union-attr]
+        for i in set(range(len(cases))) - {j * len(cases) // few for j in range(few)}:
+            cases[i].add_marker(pytest.mark.slow)
     if find_compiler() is not None:
         return
     for item in items:

@@ -38,6 +38,7 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return found
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("B", [1, 9])
 def test_solves_and_their_limits(B: int, loads: list[float]) -> None:
     """Few problems have libraries of their own."""
@@ -60,6 +61,7 @@ def test_compiled_problems(loads: list[float]) -> None:
     assert len(loads) >= 2 and answer.seconds == 0.0 and Status.TIME_LIMIT not in answer.statuses
 
 
+@pytest.mark.slow
 def test_the_rows_of_a_study(loads: list[float]) -> None:
     setup = compose(["scenario=planar_trap", "study.layouts=3"])
     flight = SolveBatch(Tasks(setup, setup.layouts()), range(3), "gco", setup.solver, NoBar())

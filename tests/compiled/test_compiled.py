@@ -223,6 +223,7 @@ def native_again() -> Iterator[None]:
     use_native(True)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("form", mostly(["rates", "horizon", "free start", "pytorch", "boxes"], "rates"))
 @pytest.mark.usefixtures("native_again")
 def test_problems_of_every_form(form: str) -> None:

@@ -55,6 +55,7 @@ def densest(problem: Problem, solution: torchgco.Solution) -> float:
     return float(torch.maximum(distance - 1.1, 0.9 - distance).max())
 
 
+@pytest.mark.slow
 @compiled
 def test_few_points_keep_nearly_all_of_the_way() -> None:
     left, costs = [], []
@@ -68,6 +69,7 @@ def test_few_points_keep_nearly_all_of_the_way() -> None:
     assert costs == sorted(costs)
 
 
+@pytest.mark.slow
 @compiled
 def test_bounds_hold_where_states_overshoot() -> None:
     """A fast swing: the speed has its peak within a stage."""

@@ -115,6 +115,7 @@ def check(problem: Problem, found: Solution, least: float) -> None:
     assert (np.array(counts)[solved | verdict.feasible.numpy()] == G).all()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("d", "G", "free", "among", "solver"), [
     (2, 1, False, False, "gco"),
     (3, 1, True, False, "interior_point"),
@@ -210,6 +211,7 @@ def test_a_gate_that_is_not_passed_is_named() -> None:
             assert gates.told(row, knot, problem.dynamics) == f"the {what} of gate {g + 1}"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("along", "knots"), [
     ([1.0, 1.04], [19, 21]), ([1.0, 1.04], [19, 22]), ([1.0, 1.04], [19, 23]), ([0.02, 1.98], [1, N - 1]),
 ])  # fmt: skip

@@ -68,6 +68,7 @@ def made(*parts: Any, integrator: Any = "rk4", by_hand: bool = False, x0: Tensor
 BUDGET = Integral(spent, most=MOST)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4", "radau5"])
 def test_a_budget_is_that_of_a_state_written_by_hand(integrator: str) -> None:
     problem, other = made(BUDGET, integrator=integrator), made(integrator=integrator, by_hand=True)
@@ -159,6 +160,7 @@ def test_each_problem_has_its_own_horizon() -> None:
     torch.testing.assert_close(solution.U[0, :15], torchgco.solve(alone).U[0], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("segments", [1, 2])
 def test_a_budget_in_free_time_is_that_of_a_state_written_by_hand(segments: int) -> None:
     time = FreeTime(0.3, 2.0, weight=1.0, segments=segments)

@@ -90,6 +90,7 @@ def dense(problem: Problem, rows: Any) -> tuple[Tensor, Tensor, Tensor]:
     return v[:, :2], v[:, 2 : 2 + N], v[:, 2 + N :]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("parts", "rows"),
     [

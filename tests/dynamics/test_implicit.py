@@ -88,6 +88,7 @@ def test_a_step_has_its_order(method: str) -> None:
     assert np.log2(errors[0] / errors[1]) == pytest.approx(ORDER_OF[method], abs=0.35)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("field", mostly([van_der_pol, robertson, lagging], robertson))
 def test_derivatives_are_those_of_the_implicit_function(method: str, field) -> None:
@@ -110,6 +111,7 @@ def test_derivatives_are_those_of_the_implicit_function(method: str, field) -> N
         assert torch.allclose(hessian[..., i], slope, rtol=1e-4, atol=1e-4 * float(hessian.abs().max()))
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize(
     ("stiffness", "least"), mostly([(100.0, 4.3022), (1000.0, 4.3112)], (100.0, 4.3022), several=True)
@@ -132,6 +134,7 @@ def test_a_problem_does_not_depend_on_its_batch() -> None:
         assert torch.equal(alone.U[0], whole.U[i]) and torch.equal(alone.X[0], whole.X[i])
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("method", mostly(METHODS, "radau3", "radau5"))
 def test_c_and_pytorch_find_the_same(method: str) -> None:
@@ -143,6 +146,7 @@ def test_c_and_pytorch_find_the_same(method: str) -> None:
     assert torch.allclose(in_c.cost, in_pytorch.cost, rtol=1e-9)
 
 
+@pytest.mark.slow
 @compiled
 def test_a_lag_is_flown_as_it_is_planned() -> None:
     model = FunctionDynamics(lagging, n=3, m=1, dt=0.1, integrator="radau5")
@@ -176,6 +180,7 @@ def swing_up(function, algebraic: int, integrator: str = "radau5") -> Problem:
     return Problem(model, cost, [ControlBounds(-6.0, 6.0)], torch.tensor([[0.0, -1.0, 0.0, 0.0]]), N=60)
 
 
+@pytest.mark.sampled(1)
 @compiled
 @pytest.mark.parametrize(("function", "count", "drift"), [(pendulum_on_its_circle, 2, 1e-8), (pendulum, 1, 1e-5)])
 def test_algebraic_states(function, count: int, drift: float) -> None:

@@ -82,6 +82,7 @@ def test_every_scenario_has_a_model_that_the_matrix_names() -> None:
     assert set(MODEL) | {"layouts", "map"} == set(options_of("scenario")) and set(OF_MODEL) == set(options_of("model"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", mostly(EXPERIMENTS, *EXPERIMENTS[1:]))
 def test_every_experiment_composes_with_every_scenario_model_and_solver(experiment: str) -> None:
     """As it is, and on every scenario and file; models are named or left to the scenario, solvers take turns."""
@@ -101,6 +102,7 @@ def test_every_experiment_composes_with_every_scenario_model_and_solver(experime
             assert setup.vehicle.name == model and (setup.mission is not None) == (experiment in (*MISSIONS, "race"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", mostly(MISSIONS, *MISSIONS[1:]))
 def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment: str) -> None:
     for mission in options_of("mission"):
@@ -120,6 +122,7 @@ def test_every_loop_and_plant_composes_and_a_mission_can_be_left_out(experiment:
         assert checked(*words).mission is None
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("scenario", mostly(MODEL, *set(MODEL) - set(tuple(MODEL)[::3])))
 def test_a_model_that_cannot_fly_a_scenario_is_refused_with_one_that_can(scenario: str) -> None:
     fitting = (

@@ -46,6 +46,7 @@ def test_a_study_of_fleets(run, run_until, tmp_path) -> None:
     assert run(*WORDS, "hydra.run.dir=out")[1].startswith("Already done")
 
 
+@pytest.mark.slow
 def test_rates_over_the_number_of_vehicles(run, tmp_path) -> None:
     words = [WORDS[0], "scenario=fleet_door", "study.layouts=1", "study.workers=1", "study.figures=false"]
     code, _, err = run("-m", *words, "scenario.vehicles=2,3")

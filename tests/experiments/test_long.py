@@ -68,6 +68,7 @@ def test_csv_files_of_a_sweep_name_layout_solver_and_swept_values(swept: Path) -
     assert last == [[1, "ilqr", number, limit]] and table.columns[0] == "t [s]"
 
 
+@pytest.mark.slow
 def test_a_run_that_was_flown_alone_gets_the_columns_of_its_sweep(run, tmp_path: Path) -> None:
     """A study alone has the columns of before, whatever its command changes."""
     code, _, err = run("solver=ilqr", "study.baselines=[hold]", f"{NUMBER}=2", f"{LIMIT}=1", *WORDS)
@@ -82,6 +83,7 @@ def test_a_run_that_was_flown_alone_gets_the_columns_of_its_sweep(run, tmp_path:
     assert all({NUMBER, LIMIT} <= set(study.tables[0].columns) and not study.differs for study in verified)
 
 
+@pytest.mark.slow
 def test_a_changed_swept_value_is_found(swept: Path) -> None:
     folder = next(swept.glob("*/trials.parquet")).parent
     table = pd.read_parquet(folder / "trials.parquet")
@@ -90,6 +92,7 @@ def test_a_changed_swept_value_is_found(swept: Path) -> None:
     assert set(study.tables[0].differences["column"]) == {NUMBER}
 
 
+@pytest.mark.slow
 def test_jobs_that_share_studies_of_a_sweep_give_them_its_columns(run, tmp_path: Path) -> None:
     code, _, err = run(*SWEEP, "study.jobs=2", "study.job=range(0,2)")
     assert code == 0, err
@@ -140,6 +143,7 @@ NAMES = [
 FILES = {"trials.parquet", "summary.csv", "layouts.npz", "solutions.npz", ".hydra"}
 
 
+@pytest.mark.slow
 def test_a_sweep_keeps_the_names_of_before(swept: Path) -> None:
     for table, path in zip(tables(swept), sorted(swept.glob("*/trials.parquet")), strict=True):
         assert [name for name in table.columns if name in NAMES] == NAMES

@@ -64,6 +64,7 @@ def few_figures(monkeypatch) -> None:
         monkeypatch.setattr(draw, f"{name}_figure", lambda *_: Figure())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_figures")
 def test_a_mission_with_a_footprint_is_drawn_and_verified_with_it(run, tmp_path) -> None:
     """The command's own judge: a flat body beside a sphere, which it touches unless it is turned, as by hand."""
@@ -154,6 +155,7 @@ def test_a_start_in_contact_is_a_collision_and_the_others_fly(run, tmp_path) -> 
     assert trials(tmp_path)["outcome"].tolist()[:2] == ["COLLISION", "TIMEOUT"]
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(
     ("words", "field"),
     [

@@ -57,6 +57,7 @@ def test_a_sweeper_gets_a_number_for_each_job(returned: list[Any], run, tmp_path
     assert code == 0 and all(isinstance(report, Report) for report in returned[2:]), "without an objective as before"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize(
     ("words", "told"),

@@ -42,6 +42,7 @@ def test_the_settings_of_a_baseline_are_part_of_a_study(run, tmp_path) -> None:
     assert contents(tmp_path / "out") == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_the_settings_of_a_baseline_are_part_of_the_default_folder(run, tmp_path) -> None:
     for limit in (1, 2, 1):
@@ -59,6 +60,7 @@ def test_a_stopped_study_is_not_finished_with_other_settings(run, run_until, tmp
     assert code == 2 and "max_outer_iterations" in problem_line(err)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize(
     "words", [["seed=1"], ["study.batch_size=0"], ["scenario.num_obstacles=4"], ["study.baselines=[mppi]"]]

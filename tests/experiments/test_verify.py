@@ -120,6 +120,7 @@ COLUMNS = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("column", COLUMNS)
 def test_a_changed_value_is_found(column: str, out, capsys) -> None:
     change(out, column, 4)

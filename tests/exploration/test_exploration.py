@@ -51,6 +51,7 @@ def flown() -> tuple[Problem, MissionLog]:
     return problem, mission().fly(problem, seed=1)
 
 
+@pytest.mark.slow
 def test_goals_behind_a_wall_that_was_not_known_are_reached(flown: tuple[Problem, MissionLog]) -> None:
     problem, log = flown
     for b in range(2):

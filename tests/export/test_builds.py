@@ -79,6 +79,7 @@ def ran(folder: Path, sketch: str, loops: int, tmp_path: Path) -> str:
     return said(tmp_path / "run", folder=folder)
 
 
+@pytest.mark.slow
 @needs("gcc", "g++")
 def test_a_sketch_steps_once_a_period(folders: dict[str, Path], tmp_path: Path) -> None:
     lines = ran(folders["arduino"], "car", 40, tmp_path).splitlines()
@@ -90,6 +91,7 @@ def test_a_sketch_finds_the_bits_of_python(folders: dict[str, Path], tmp_path: P
     assert ran(folders["arduino"], "car_test", 1, tmp_path).splitlines() == [SAME, "the same bits"]
 
 
+@pytest.mark.sampled(1)
 @needs("cmake", "gcc")
 @pytest.mark.parametrize("program", ["main", "test"])
 def test_a_sample_of_zephyr_runs(folders: dict[str, Path], program: str, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return exported(problem, tmp_path_factory.mktemp("car"), "x_ref", "centers")
 
 
+@pytest.mark.sampled(1)
 @needs("gcc")
 @pytest.mark.parametrize("level", mostly(["-O0", "-O1", "-O2", "-O3", "-Os"], "-O1", "-O3"))
 def test_levels_of_gcc(folder: Path, tmp_path: Path, level: str) -> None:
@@ -35,6 +36,7 @@ def test_levels_of_gcc(folder: Path, tmp_path: Path, level: str) -> None:
     assert said(tmp_path / "run", folder=folder).startswith(SAME)
 
 
+@pytest.mark.slow
 @needs("gcc")
 def test_fused_by_the_library_where_the_processor_is_not_told(folder: Path, tmp_path: Path) -> None:
     said("gcc", *STRICT, "-O2", "-DTGCO_FUSED", "car.c", "car_test.c", "-lm", "-o", tmp_path / "run", folder=folder)
@@ -48,6 +50,7 @@ def test_clang(folder: Path, tmp_path: Path, level: str) -> None:
     assert said(tmp_path / "run", folder=folder).startswith(SAME)
 
 
+@pytest.mark.slow
 @needs("gcc", "g++")
 def test_the_header_serves_c_plus_plus(folder: Path, tmp_path: Path) -> None:
     said("gcc", *STRICT, "-O1", "-c", "car.c", "-o", tmp_path / "car.o", folder=folder)
@@ -56,6 +59,7 @@ def test_the_header_serves_c_plus_plus(folder: Path, tmp_path: Path) -> None:
     assert said(tmp_path / "run", folder=folder).count("status 1") == 20
 
 
+@pytest.mark.slow
 @needs("gcc")
 def test_sanitizers_find_nothing(folder: Path, tmp_path: Path) -> None:
     checks = "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
@@ -93,6 +97,7 @@ def test_no_heap_no_state_and_four_names(folder: Path, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.sampled(1)
 @needs("gcc", "size")
 @pytest.mark.parametrize("kind", SIZES)
 def test_sizes_do_not_grow(kind: str, tmp_path: Path) -> None:
@@ -110,6 +115,7 @@ def test_sizes_do_not_grow(kind: str, tmp_path: Path) -> None:
     assert 0 <= told - workspace <= 64
 
 
+@pytest.mark.slow
 @needs("cmake", "gcc")
 def test_its_folder_builds_by_cmake(folder: Path, tmp_path: Path) -> None:
     said("cmake", "-S", folder, "-B", tmp_path / "build", folder=folder)

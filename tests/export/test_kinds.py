@@ -44,6 +44,7 @@ def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHGCO_CFLAGS", "-O1")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning", "ignore::torchgco.HorizonWarning")
 @pytest.mark.parametrize("kind", mostly(KINDS, *(set(KINDS) - set(QUICK))))
 def test_steps_have_the_bits_of_python(kind: str, tmp_path: Path) -> None:

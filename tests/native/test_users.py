@@ -40,6 +40,7 @@ def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
     return torch.cat((slopes.unsqueeze(-1), curvatures.triu()), dim=-1)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("unit", mostly([False, True], True), ids=["as it is", "in cost units"])
 @pytest.mark.parametrize("name", mostly(PROBLEMS, *list(PROBLEMS)[1::2]))
 def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> None:
@@ -67,6 +68,7 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
         assert [bool(x) for x in out.converged] == [ends[i][0] for i in range(problem.B)]
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_unit_of_cost_is_pytorchs(name: str) -> None:
     problem, same = PROBLEMS[name](), PROBLEMS[name]()

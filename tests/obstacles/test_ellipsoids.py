@@ -153,6 +153,7 @@ def test_ways_among_drawn_ones_are_found(d: int) -> None:
     assert bool((certified <= dense + 0.01).all())  # paths leave their chords
 
 
+@pytest.mark.slow
 def test_moving_ones_horizons_and_free_time() -> None:
     crossing = Ellipsoids([[2.0, -1.6]], [[0.3, 0.6]], 0.1, [0.4], [[0.0, 0.8]])
     problem = among(crossing, horizon=[40])
@@ -167,6 +168,7 @@ def test_moving_ones_horizons_and_free_time() -> None:
     assert bool(judge(resting, found.U, times=found.t).reached.all())
 
 
+@pytest.mark.slow
 def test_a_body_and_numbers_that_are_written() -> None:
     turned = lambda x: torch.diag_embed(torch.ones_like(x[..., :2]))
     given = {"centers": [[2.0, 0.2]], "semi_axes": [[0.3, 0.5]]}

@@ -77,6 +77,7 @@ def problem_of(constraints: list[Any]) -> Problem:
 DRAWS = [*((seed, "native") for seed in range(8)), (2, "eager"), (7, "eager")]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")
 @pytest.mark.parametrize(("seed", "native"), mostly(DRAWS, *DRAWS[4:], several=True), indirect=["native"])
 def test_an_empty_kind_changes_no_bit(seed: int, native: bool) -> None:

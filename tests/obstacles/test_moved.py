@@ -63,6 +63,7 @@ def least_between(part: Any, X: Tensor, shares: int = 300) -> Tensor:
     return outside.amin(2) - part.boxes.inflated_radii.unsqueeze(1)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")
 @pytest.mark.parametrize("d", [2, 3])
 def test_an_even_motion_is_that_of_spheres_with_velocities(d: int) -> None:

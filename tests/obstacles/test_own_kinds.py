@@ -134,6 +134,7 @@ def flight(moving: bool, body: Body | None = None, horizon: list[int] | None = N
     return Problem(model, cost, parts, x0, N=50, goal=Goal([4, 0, 0], radius=0.2), horizon=horizon)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("moving", [False, True])
 def test_it_is_solved_judged_and_drawn(moving: bool) -> None:
     problem = flight(moving)

@@ -34,6 +34,7 @@ def test_costs_are_those_of_ipopt_by_hand(name: str) -> None:
         assert float(solution.cost) == pytest.approx(cost, rel=share)
 
 
+@pytest.mark.slow
 def test_batches_end_as_their_problems_do() -> None:
     many = CASES["two-burn orbit raise"].phases(5)
     solution = torchgco.solve(many)

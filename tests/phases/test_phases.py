@@ -134,6 +134,7 @@ ROWS: dict[str, Callable[[], list[Constraint]]] = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", ROWS)
 def test_rows_of_a_second_phase_are_those_of_its_problem(kind: str) -> None:
     """The first phase stays where the second begins, so that this one alone has something to choose."""

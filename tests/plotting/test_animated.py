@@ -35,6 +35,7 @@ def changes_in(path: Path) -> list[int]:
     return [int(np.abs(a - b).sum()) for a, b in pairwise(pictures)]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("others", [(), (Ellipsoids([[0.5, 1.0]], [[0.1, 0.2]], 0.1, [0.3], [[0.0, -0.5]]),)])
 def test_a_film_shows_what_moves(others: tuple[object, ...], tmp_path: Path) -> None:
     stated = problem(MOVING, *others)

@@ -69,6 +69,7 @@ def drawn(seed: int) -> tuple[Vehicle, Layouts]:
     return vehicle, Layouts(centers, rng.uniform(0.1, 0.6, (L, 3)), velocities=velocities, **kept)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 5, 7])
 def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, layouts = drawn(seed)

@@ -225,6 +225,7 @@ BRANCHED = {
 FORMS = ["plain", "single", "horizon", "one start not finite", "bounded rates", "free time"]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("form", "part"),
     mostly(

@@ -117,6 +117,7 @@ def solved(problem: Problem, solver: Any) -> tuple[Solution, list[str]]:
 PARTS = "model", "stage", "end", "rows", "Model", "Stepped", "Price"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("part", "guard", "solver"),
     [(part, GUARDS[i % 3], "al_ilqr") for i, part in enumerate(PARTS)]

@@ -126,6 +126,7 @@ def wall() -> FunctionConstraint:
     return FunctionConstraint(lambda x: x[..., :1] - 5.0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "parts", [[], [RateBounds(-0.3, 0.3, previous=[0.0, 0.0])], [Link(components=[2, 3])]], ids=["", "rates", "link"]
 )
@@ -246,6 +247,7 @@ def test_what_comes_to_rest_is_no_faster_than_states_may_be_and_turns_as_before(
     assert bool((turned & back).any()) and bool((X[1, :, -1, 0] > 0.9).any())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("form", ["rates", "rates from others", "two bounds", "free time"])
 def test_bounds_of_states_hold_in_the_form_that_solvers_work_on(form: str) -> None:
     """Whose states are followed by further ones: the controls before, or the length of a stage."""

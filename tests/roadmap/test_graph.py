@@ -98,6 +98,7 @@ def both(roadmap: Roadmap, s: Scene, count: int) -> tuple[tuple[Tensor, Tensor],
     return first, roadmap.paths(s, count)
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", mostly(SCENES, *(f"drawn {d}-D, {M} spheres" for d in (2, 3) for M in (2, 5, 12))))
 @pytest.mark.parametrize("size", mostly(["usual", "small"], "small"))
 def test_both_return_the_same_paths(name: str, size: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,6 +38,7 @@ def clearance(layout: Layouts, p: np.ndarray, t: float) -> float:
     return least
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("scenario", ALL)
 def test_a_layout_depends_on_seed_and_number_alone(scenario) -> None:
     many = scenario.draw([0, 5], seed=3)
@@ -46,6 +47,7 @@ def test_a_layout_depends_on_seed_and_number_alone(scenario) -> None:
     assert many.name == scenario.name
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("scenario", QUICK)
 def test_a_point_gets_through_with_room_from_rest_to_rest(scenario: AmongMovers) -> None:
     for number in range(3):

@@ -74,6 +74,7 @@ def test_who_may_choose_the_time_takes_the_gap_that_is_cheapest(seed: int) -> No
     assert torch.equal(alone.U[0], solution.U[2]) and torch.equal(alone.duration[0], solution.duration[2])
 
 
+@pytest.mark.slow
 def test_times_stay_within_their_bounds() -> None:
     problem = lanes(2, 3, 1.0, least=1.3, most=1.4)
     solution = solve(problem, verbose=False)

@@ -80,6 +80,7 @@ def around_a_bend(rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, fl
     return filled((right + 2.5, tall), free), (0.35, 0.35, 0.25), start, [right + 1.0, high + 0.5 * wide]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly(range(6), 0, 1, 3, 4, 5))
 def test_a_body_takes_the_way_of_the_ball_around_it(seed: int) -> None:
     """The ball inside of it fits through the passage, which leads straight to the goal."""

@@ -23,6 +23,7 @@ def slalom(radii: list[float]) -> Problem:
     return Problem(point, cost, parts, start, 12, Goal(state=END, required=True), time=FreeTime(0.3, 8.0, weight=1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 def test_a_trajectory_in_free_time_is_cleared_between_the_knots() -> None:
     problem = slalom([0.4, 0.25, 0.02])

@@ -74,6 +74,7 @@ def test_what_is_known_of_starts_holds_among_fewer_obstacles(inside: bool) -> No
     assert near is not None and bool(near.call.problem.start_is_clear.all())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", mostly(["spheres", "boxes", "body"], "body"))
 def test_far_obstacles_change_no_bit(kind: str) -> None:
     few, many, U0 = planar(kind, 9.0)
@@ -139,6 +140,7 @@ def refined(problem: Problem, U0: torch.Tensor, solution: Solution) -> SolveEnd:
     return continued(InteriorPoint(), Call.checked(problem, U0), start)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("kind", ["spheres", "boxes"])
 @pytest.mark.parametrize("enough", [True, False], ids=["the near ones", "too few"])

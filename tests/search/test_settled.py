@@ -74,6 +74,7 @@ def guessed() -> tuple[Problem, Tensor]:
     return problem.take(sound[:4]), found.U[sound[:4]]
 
 
+@pytest.mark.slow
 def test_a_sound_guess_comes_back_sound_and_costs_no_more() -> None:
     """Before, trajectories came back that arrive, and touch a box between two knots by up to 9 mm."""
     problem, U = guessed()

@@ -91,6 +91,7 @@ def carried() -> Problem:
 CASES = {"required": lambda: crossing(10, required=True), "gates": gated, "map": mapped, "body": carried}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")  # of the solver without the row
 @pytest.mark.parametrize("case", list(CASES))
 def test_lanes_are_crossed(case: str) -> None:

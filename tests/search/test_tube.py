@@ -66,6 +66,7 @@ STEPS = FunctionDynamics(UNICYCLE.step, 4, 2, 0.1, "none", position=slice(0, 2))
 MODELS = pytest.mark.parametrize("model", [UNICYCLE, STEPS], ids=["driven", "tracked"])
 
 
+@pytest.mark.sampled(1)
 @MODELS
 def test_it_arrives_behind_a_thick_wall_of_a_map(model: Dynamics) -> None:
     problem = room(model=model)

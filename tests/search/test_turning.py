@@ -95,6 +95,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("kind", "walls", "required", "way"), mostly(CASES, *CASES[:3:2], CASES[3], several=True))
 def test_the_goal_behind_is_reached(kind: str, walls: bool, required: bool, way: float) -> None:
     check_reached(turning(kind, headings(9, seed=len(kind)), walls, required, way), "gco", 0)
@@ -116,6 +117,7 @@ def test_all_headings_of_half_a_turn(kind: str, solver: str, seed: int) -> None:
 WALLED = [(kind, walls) for kind in ("car", "trailer") for walls in (False, True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "walls"), mostly(WALLED, *WALLED[1:], several=True))
 def test_requiring_the_goal_costs_no_more_than_stating_it(kind: str, walls: bool) -> None:
     """What reaches the goal without its being required is a plan where it is: these cost up to 2.4 times as much."""

@@ -128,6 +128,7 @@ def test_gradients_of_a_batch_without_derivatives_are_zero() -> None:
     assert x0.grad is not None and not x0.grad.any()
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("form", [*FORMS, "discs", "boxed"])
 def test_no_gradient_is_missing_where_there_is_none(form: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,6 +53,7 @@ def check(
     assert float(mine[0].abs()) > 1e-3 or name == "lower"
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", mostly(KINDS, *KINDS[::3], *KINDS[1::3]))
 def test_among_discs(name: str) -> None:
     check(discs, numbers, name)

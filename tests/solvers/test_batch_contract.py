@@ -87,6 +87,7 @@ def solve_rows(solver, problem: Problem, U0, rows: list[int]) -> Solution:
     return solver.solve(problem.take(index), U0[index], seed=3, ids=index)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_alone_in_any_batch_and_in_any_order(batch: str, solver: str) -> None:

@@ -206,6 +206,7 @@ def test_convergence_with_equalities_alone_is_quadratic(monkeypatch) -> None:
     assert len(pairs) >= 2 and all(b <= 5 * a * a for a, b in pairs) and errors[-1] < 1e-12
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", [True, False])
 def test_options_of_ipopt_reach_the_kernels(native: bool) -> None:
     problem, U0 = circle(torch.tensor([0.8], dtype=D))
