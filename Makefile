@@ -10,7 +10,8 @@
 # make floors   drawn floor plans, gco against a grid path that is pursued (ARGS="--maps DIR": real maps, too): some minutes
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: kernels' bits and speed on a GPU (ten minutes), then the same there
-# make docs    the API reference from the docstrings, in docs/api; make figures: the figures of docs/algorithm.md;
+# make docs    the API reference from the docstrings, in docs/api; site: the manual with it and a search, as a site in build/site;
+#              dist: sdist and wheel, in dist (docs/releasing.md); make figures: the figures of docs/algorithm.md;
 #              make paper: the paper's figures, tables and missions by our solvers, in benchmarks/results/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
 #              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); robustness: those of wrong input, kills and
@@ -44,7 +45,7 @@ unexport PYTHONDONTWRITEBYTECODE
 SPEED := $(BIN)/python -m benchmarks.speed
 
 .PHONY: floors study test test-all test-slurm robustness versions lint types clean quality oracle general worlds maps maps-known maps-seen \
-    benchmark benchmark-gpu ladder docs figures paper
+    benchmark benchmark-gpu ladder docs site dist figures paper
 
 study: $(RUNTIME)
 	$(BIN)/torchgco $(ARGS)
@@ -108,6 +109,13 @@ benchmark-gpu: $(PEERS)
 
 docs: $(DEV)
 	$(BIN)/python docs/reference.py
+
+site: $(DEV)
+	$(BIN)/python docs/manual.py $(ARGS)
+
+dist: $(DEV)
+	rm -rf dist
+	$(BIN)/python -m build
 
 figures: $(RUNTIME)
 	$(BIN)/python docs/figures.py
