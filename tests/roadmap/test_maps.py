@@ -27,6 +27,7 @@ from torchgco import (
 )
 from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.maps.field import BoundField
+from torchgco.native.compiler import NativeError
 from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.roadmap.blocks import blocks_of
 from torchgco.roadmap.geometry import Inflated, length
@@ -34,6 +35,7 @@ from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.lattice import lattice_of
 from torchgco.roadmap.mapped import Ways, _swept_on_the_way, keys, swept, tightened
 from torchgco.roadmap.scene import has_paths, scene_of
+from torchgco.roadmap.shortest import shortest_way
 from torchgco.solvers.contracts import Solver
 
 R = 0.2
@@ -247,3 +249,17 @@ def test_gco_flies_around_walls_with_the_same_bits_alone_and_in_a_batch() -> Non
     from torchgco import judge
 
     assert bool(judge(problem, whole.U).reached.all())
+
+
+def test_without_a_compiler_no_way_is_found_in_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHGCO_CC", "none")
+    cells = np.zeros((30, 24), bool)
+    cells[14:16, :14] = True
+    problem = problem_in(cells, [0.5, 1.0], [2.5, 1.0], radius=0.1)
+    seen = scene_of(problem, torch.zeros(problem.B, problem.N, problem.m, dtype=torch.float64))
+    assert seen is not None
+    paths, found = Roadmap().paths(seen, 3)
+    assert not bool(found.any()) and bool((paths[:, :, 1:] == seen.goal[:, None, None]).all())
+    assert classes(paths, seen.obstacles).shape == paths.shape[:2]
+    with pytest.raises(NativeError, match="state the stages"):
+        shortest_way(DistanceField.of(OccupancyGrid(cells, [0.0, 0.0], 0.1)), 0.1, [0.5, 1.0], [2.5, 1.0])

@@ -88,6 +88,8 @@ def in_one(scene: Scene, b: int, overlap: float, search: Search) -> list[Array]:
 def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     """Whether paths (B, K, P, 2) wind around every blocked region of the maps by the same angle, (B, K, K)."""
     same = torch.ones(*paths.shape[:2], paths.shape[1], dtype=torch.bool, device=paths.device)
+    if library_for(paths.shape[-1]) is None:
+        return same  # nothing was found: all are the straight line
     for b, some in enumerate(paths.double().cpu().numpy()):
         own = moved(take(obstacles, torch.tensor([b], device=paths.device)), CPU)
         for field in own.maps:

@@ -29,7 +29,7 @@ def shortest_way(field: DistanceField, radius: float, start: Any, goal: Any) -> 
         NativeError: without a compiler.
     """
     if library_for(field.d) is None:
-        raise NativeError("the way through a map, by which a horizon is chosen, is found by a C compiler's code")
+        raise NativeError("the way through a map, by which its stages are chosen, takes a C compiler: state the stages")
     ends = np.array([start, goal], float)
     like = torch.from_numpy(ends[:1])
     bound = Field(field, radius).bind(Dimensions(1, 1, field.d, 0, None, slice(0, field.d), like))
