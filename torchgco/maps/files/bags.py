@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.extras import imported
 from torchgco.base.memory import limited
 from torchgco.maps.files.rotated import rotated
 from torchgco.maps.files.source import MOST_CELLS, MOST_POINTS, Source, check_far, finite_points, made
@@ -36,19 +37,15 @@ def read_bag(source: Source, topic: str | None) -> OccupancyGrid | np.ndarray:
     if set(str(source.path)) & set("?#%"):  # rosbags hands it to SQLite as an address
         source.refuse("a bag whose path has no ?, # or %", "one that has")
     ros1 = source.path.suffix.lower() == ".bag"
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        source.refuse("a bag with the extra maps: pip install 'torchgco[maps]'", "no rosbags")
+    reader = imported(f"rosbags.rosbag{1 if ros1 else 2}", "maps", source.field).Reader
     if not source.path.is_dir():
         source.size(BAG_FILE)
     with source.library(BAG_FILE), limited(BAG_MEMORY):
-        with Reader1(source.path) if ros1 else Reader2(source.path) as bag:
+        with reader(source.path) as bag:
             name = _chosen(source, bag.connections, topic)
             connection, raw = _last(source, bag, [one for one in bag.connections if one.topic == name])
-        store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        types = imported("rosbags.typesys", "maps", source.field)
+        store = types.get_typestore(types.Stores.ROS1_NOETIC if ros1 else types.Stores.ROS2_HUMBLE)
         message = (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(raw, connection.msgtype)
     return {CLOUD: cloud_of, GRID: grid_of}[connection.msgtype](source, message)
 
