@@ -24,7 +24,7 @@ from torch import Tensor
 from benchmarks.lib.recorded import solve
 from torchgco import Problem, Solution, presets
 from torchgco.plotting.style import INK, PALETTE, save, tidy
-from torchgco.roadmap.cheapest import TorchSearch
+from torchgco.roadmap.cheapest import GraphSearch, library_for
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, MARGIN, NEIGHBOURS, NODES, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
 from torchgco.scenarios import Layouts
@@ -124,8 +124,9 @@ def _edges(problem: Problem) -> list[np.ndarray]:
     """Segments of the edges of the roadmap."""
     scene = scene_of(problem.in_cost_units(), problem.at_rest[1])
     roadmap: Roadmap = presets.gco(problem).passes.paths.roadmap
-    assert scene is not None
-    search = TorchSearch(scene.obstacles.reduced(roadmap.max_overlap), MARGIN)
+    library = library_for(2)
+    assert scene is not None and library is not None
+    search = GraphSearch(library, scene.obstacles.reduced(roadmap.max_overlap), MARGIN)
     cube = halton(roadmap.num_halton, 2).to(scene.start)
     graph: Any = search.graph(scene.start, scene.goal, cube, NODES, NEIGHBOURS, HALTON_NEIGHBOURS)
     points, free = graph.points[0].numpy(), torch.isfinite(graph.lengths[0]).nonzero().tolist()

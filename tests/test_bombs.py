@@ -15,7 +15,7 @@ from torchgco import InputError
 from torchgco.experiments.reports.finished import Study
 from torchgco.experiments.results.limits import read_npz
 
-SLOW = {name for name in BOMBS if "100 MB" in name}  # a million records are read, some seconds
+SLOW = {name for name in BOMBS if "100 MB" in name}  # some seconds
 SLOW |= {"trials.parquet, pages of 1.2 GB that name 100 bytes"}
 
 

@@ -31,7 +31,7 @@ CALLS = (
     "torchgco.native.engine.run",
     "torchgco.native.interior.run",
     "torchgco.native.sampler.run",
-    "torchgco.roadmap.native.NativeSearch._run",
+    "torchgco.roadmap.cheapest.GraphSearch._run",
 )
 PYTHON = "Python and PyTorch"
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from tests.engines import engine_of
 from tests.native.test_engine import running_state
 from tests.problems import boxed_batch, planar_batch
+from tests.reference.graph_search import searched_by_torch
 from tests.slow import mostly
 from torchgco import ILQR, MPPI, LineSearch, Problem, kernels
 from torchgco.base.draws import DrawKey
@@ -35,7 +36,7 @@ from torchgco.native.compiler import NativeError, build, find_compiler
 from torchgco.native.declarations import Header, Structure, defines, enumerations
 from torchgco.native.includes import C, included, joined
 from torchgco.native.structures import CONSTANTS, End, Options
-from torchgco.roadmap import native as roadmap
+from torchgco.roadmap import cheapest as roadmap
 from torchgco.roadmap import native_maps
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.roadmap.scene import scene_of
@@ -302,13 +303,10 @@ OF_ROADMAP = {
 def test_a_constant_of_the_roadmap_changes_both_searches(name: str, monkeypatch) -> None:
     usual = searched()
     for path, module in list(sys.modules.items()):
-        if path.startswith(("torchgco.roadmap", "torchgco.obstacles")) and hasattr(module, name):
+        own = path.startswith(("torchgco.roadmap", "torchgco.obstacles", "tests.reference.graph_search"))
+        if own and hasattr(module, name):
             monkeypatch.setattr(module, name, OF_ROADMAP[name])
-    roadmap._library.cache_clear()
-    try:
-        changed = searched()
-    finally:
-        roadmap._library.cache_clear()
+    changed = searched()
     for native, plain in (usual, changed):
         torch.testing.assert_close(native, plain, rtol=1e-9, atol=1e-9)
     assert usual[0].shape != changed[0].shape or not torch.allclose(usual[0], changed[0], rtol=1e-6)
@@ -318,10 +316,7 @@ def searched() -> tuple[Tensor, Tensor]:
     """Different paths of several problems, by the library and by PyTorch."""
     problem, U0 = planar_batch(B=8, N=10, obstacles=8)
     scene = scene_of(problem, U0)
-    assert scene is not None and roadmap.library_for(problem.x0[:, :2]) is not None
-    made = []
-    for native in (True, False):
-        kernels.use_native(native)
-        made.append(Roadmap(num_halton=16).paths(scene, 3)[0])
-    kernels.use_native(True)
-    return made[0], made[1]
+    assert scene is not None
+    found = Roadmap(num_halton=16).paths(scene, 3)[0]
+    with searched_by_torch():
+        return found, Roadmap(num_halton=16).paths(scene, 3)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from tests.engines import engine_of
 from tests.reference import boxes as brute_force
+from tests.reference.graph_search import searched_by_torch
 from tests.search.scenes import first_of_class
 from tests.slow import mostly
 from torchgco import (
@@ -27,7 +29,6 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.kernels import use_native
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -74,11 +75,8 @@ def test_paths_are_free_and_the_same_in_c_and_in_pytorch(d: int, spheres: int) -
     s, parts = scene(d, B=6, spheres=spheres)
     roadmap = Roadmap()
     paths, found = roadmap.paths(s, 3)
-    use_native(False)
-    try:
+    with searched_by_torch():
         slow_paths, slow_found = roadmap.paths(s, 3)
-    finally:
-        use_native(True)
     assert torch.equal(found, slow_found) and int(found.sum()) >= 4
     torch.testing.assert_close(paths, slow_paths, rtol=0, atol=1e-12)
     for b in found.nonzero().flatten().tolist():
@@ -97,13 +95,10 @@ def test_without_its_boxes_a_scene_is_that_of_spheres_alone() -> None:
     s, _ = scene(2)
     spheres, boxes, _ = s.obstacles
     assert boxes is not None
-    for native in (True, False):
-        use_native(native)
-        try:
+    for by in (nullcontext(), searched_by_torch()):
+        with by:
             with_boxes = Roadmap().paths(replace(s, obstacles=Inflated(spheres, absent(boxes))), 2)
             alone = Roadmap().paths(replace(s, obstacles=Inflated(spheres)), 2)
-        finally:
-            use_native(True)
         assert torch.equal(with_boxes[0], alone[0]) and torch.equal(with_boxes[1], alone[1])
 
 

@@ -1,8 +1,7 @@
-"""The roadmap's search in C and in PyTorch returns the same paths, also where several cost the same."""
+"""The roadmap's search returns the paths of a plain one in PyTorch, also where several cost the same."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.reference.graph_search import TorchSearch, searched_by_torch
 from tests.search.scenes import NONE, inflated
 from tests.slow import mostly
-from torchgco import kernels
 from torchgco.base.tree import cast, take
 from torchgco.kernels import EagerWarning
 from torchgco.obstacles.base import Solids
-from torchgco.roadmap import native as native
-from torchgco.roadmap.cheapest import HOPS, Graph, TorchSearch
+from torchgco.roadmap import cheapest, library
+from torchgco.roadmap.cheapest import HOPS, Graph, GraphSearch, library_for
 from torchgco.roadmap.geometry import Inflated, Scene
-from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import Roadmap, halton
 
 B = 3
-
-
-@pytest.fixture(autouse=True)
-def native_again() -> Iterator[None]:
-    yield
-    kernels.use_native(True)
 
 
 def uneven(points: Tensor, rows: slice) -> Tensor:
@@ -92,10 +84,9 @@ SCENES = {
 
 
 def both(roadmap: Roadmap, s: Scene, count: int) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    assert library_for(s.start) is not None
     first = roadmap.paths(s, count)
-    kernels.use_native(False)
-    return first, roadmap.paths(s, count)
+    with searched_by_torch():
+        return first, roadmap.paths(s, count)
 
 
 @pytest.mark.sampled(8)
@@ -139,10 +130,10 @@ def test_both_make_the_same_graph(name: str) -> None:
     torch.testing.assert_close(made[0], made[1], rtol=1e-12, atol=1e-12)
 
 
-def searches(obstacles: Inflated, margin: float) -> tuple[NativeSearch, TorchSearch]:
-    library = library_for(obstacles.spheres.centers)
-    assert library is not None
-    return NativeSearch(library, obstacles, margin), TorchSearch(obstacles, margin)
+def searches(obstacles: Inflated, margin: float) -> tuple[GraphSearch, TorchSearch]:
+    made = library_for(obstacles.spheres.centers.shape[-1])
+    assert made is not None
+    return GraphSearch(made, obstacles, margin), TorchSearch(obstacles, margin)
 
 
 def chain(points: int) -> Graph:
@@ -196,7 +187,7 @@ def test_a_problem_has_the_same_bits_in_every_batch() -> None:
     columns = zip(*(vars(part.obstacles.spheres).values() for part in parts), strict=True)
     s = Scene(*ends, Inflated(Solids(*map(torch.cat, columns))), uneven)
     whole, found = Roadmap().paths(s, 3)
-    assert len(whole) > native.SEARCHES_AT_ONCE
+    assert len(whole) > cheapest.SEARCHES_AT_ONCE
     for rows in (torch.arange(1), torch.tensor([70]), torch.arange(81).flip(0)):
         part = Scene(s.start[rows], s.goal[rows], take(s.obstacles, rows), uneven)
         paths, arrives = Roadmap().paths(part, 3)
@@ -210,23 +201,24 @@ def test_no_problems_have_no_paths() -> None:
         assert paths.shape == (0, 2, HOPS + 1, 2) and found.shape == (0,)
 
 
-def test_pytorch_searches_in_single_precision_and_without_a_compiler(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_scenes_in_single_precision_are_searched_in_double_precision() -> None:
     s = SCENES["in the middle"]
     single = Scene(s.start.float(), s.goal.float(), Inflated(*cast(s.obstacles, torch.float32)), flat)
-    assert library_for(single.start) is None
     paths, found = Roadmap().paths(single)
     assert paths.dtype == torch.float32 and bool(found.all())
-    monkeypatch.setenv("TORCHGCO_CC", "none")
-    assert library_for(s.start) is None
-    paths, _ = Roadmap().paths(s)
-    monkeypatch.undo()
+    torch.testing.assert_close(paths, Roadmap().paths(s)[0].float(), rtol=0, atol=1e-6)
+
+
+def test_without_a_library_there_is_no_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    s = SCENES["in the middle"]
+    with monkeypatch.context() as patch:
+        patch.setenv("TORCHGCO_CC", "none")
+        paths, found = Roadmap().paths(s, 2)
+    assert not bool(found.any()) and torch.equal(paths[:, :, 1:], s.goal[:, None, None].expand(-1, 2, HOPS, -1))
     (tmp_path / "cheapest.c").write_text("not C code")
-    monkeypatch.setattr(native, "C", tmp_path)
-    native._library.cache_clear()
-    with pytest.warns(EagerWarning, match=r"PyTorch's kernels where \w+ are sought"):
-        assert library_for(s.start) is None
-    monkeypatch.undo()
-    native._library.cache_clear()
-    torch.testing.assert_close(paths, Roadmap().paths(s)[0], rtol=0, atol=1e-9)
+    library._library.cache_clear()
+    with monkeypatch.context() as patch, pytest.warns(EagerWarning, match=r"no \w+ are sought"):
+        patch.setattr(library, "C", tmp_path)
+        assert not bool(Roadmap().paths(s)[1].any())
+    library._library.cache_clear()
+    assert bool(Roadmap().paths(s)[1].all())

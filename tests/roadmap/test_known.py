@@ -8,7 +8,6 @@ import torch
 from tests.roadmap.test_roadmap import random_scene
 from tests.roadmap.test_trunks import trunks
 from tests.slow import mostly
-from torchgco.kernels import use_native
 from torchgco.roadmap import known as known_searches
 from torchgco.roadmap import roadmap as searches
 from torchgco.roadmap.geometry import Scene
@@ -18,17 +17,14 @@ from torchgco.roadmap.roadmap import Roadmap
 SOME = torch.tensor([0, 2, 3])
 
 
-@pytest.fixture(params=mostly(["native", "pytorch"], "pytorch"))
-def scene(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch):
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     """Trunks among which some problems need more points, in groups of three problems."""
     monkeypatch.setattr(searches, "LONG", 1.01)
     monkeypatch.setattr(searches, "MANY_NODES", 160)
     monkeypatch.setattr(searches, "MANY_NEIGHBOURS", 16)
-    monkeypatch.setattr("torchgco.roadmap.native.SEARCHES_AT_ONCE", 3)
-    monkeypatch.setattr(searches, "PROBLEMS_AT_ONCE", 3)
-    use_native(request.param == "native")
-    yield trunks(B=5, K=14)[0]
-    use_native(True)
+    monkeypatch.setattr("torchgco.roadmap.cheapest.SEARCHES_AT_ONCE", 3)
+    return trunks(B=5, K=14)[0]
 
 
 @pytest.mark.parametrize("room", mostly([0, 2**26], 2**26))
@@ -54,8 +50,7 @@ def test_a_search_that_goes_on_makes_no_graph(scene: Scene, monkeypatch: pytest.
         for group in (0, 3)
         for course in known.courses((roadmap, group), torch.arange(group, min(group + 3, 5))) or ()
     } == {2 + 64 + 128, 2 + 64 + 160}
-    monkeypatch.setattr("torchgco.roadmap.native.NativeSearch.graph", None)
-    monkeypatch.setattr("torchgco.roadmap.cheapest.TorchSearch.graph", None)
+    monkeypatch.setattr("torchgco.roadmap.cheapest.GraphSearch.graph", None)
     assert torch.equal(roadmap.paths(scene, 3, SOME, known)[0][:, :1], made[SOME])
 
 
@@ -66,7 +61,7 @@ def test_without_boxes_there_are_no_points_around_them() -> None:
 
 
 def test_two_threads_find_the_paths_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchgco.roadmap.native.GROUP", 2)
+    monkeypatch.setattr("torchgco.roadmap.cheapest.GROUP", 2)
     s, threads = trunks(B=5, K=14)[0], torch.get_num_threads()
     alone = Roadmap().paths(s, 3)
     torch.set_num_threads(2)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.reference.blocks import everywhere, plain_blocks
 from tests.slow import mostly
 from torchgco import (
     Boxes,
@@ -22,18 +23,19 @@ from torchgco import (
     QuadrotorPlanning,
     Roadmap,
     Spheres,
-    kernels,
     presets,
 )
 from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.maps.field import BoundField
-from torchgco.obstacles.base import Obstacles
+from torchgco.native.compiler import NativeError
+from torchgco.obstacles.base import Obstacles, Solids
 from torchgco.roadmap.blocks import blocks_of
 from torchgco.roadmap.geometry import Inflated, length
 from torchgco.roadmap.homotopy import classes
 from torchgco.roadmap.lattice import lattice_of
 from torchgco.roadmap.mapped import Ways, _swept_on_the_way, keys, swept, tightened
 from torchgco.roadmap.scene import has_paths, scene_of
+from torchgco.roadmap.shortest import shortest_way
 from torchgco.solvers.contracts import Solver
 
 R = 0.2
@@ -208,14 +210,11 @@ def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -
     def price(points: np.ndarray) -> np.ndarray:
         return 1.0 + points[:, 0] ** 2
 
-    made = []
-    for native in (True, False):
-        kernels.use_native(native)
-        lattice = lattice_of([replace(field, field=replace(field.field))], [], ends)
-        blocks = blocks_of(lattice, 0.15, 2**12, 0.01, merged)
-        made.append((lattice.map.everywhere, blocks, Ways(blocks, ends, price, R, 0.0)))
-    kernels.use_native(True)
-    (clear, blocks, ways), (other_clear, other, other_ways) = made
+    lattice = lattice_of([field], [], ends)
+    blocks = blocks_of(lattice, 0.15, 2**12, 0.01, merged)
+    other = plain_blocks(lattice, blocks, 0.01, merged)
+    ways, other_ways = (Ways(one, ends, price, R, 0.0) for one in (blocks, other))
+    clear, other_clear = lattice.map.everywhere, everywhere(lattice.map)
     np.testing.assert_allclose(clear, other_clear, rtol=1e-6, atol=1e-7)
     assert (blocks.layers == 2).any() == merged and len(blocks.nodes) == len(other.nodes)
     held = blocks.block >= 0  # blocks are numbered in another order
@@ -224,10 +223,9 @@ def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -
         np.testing.assert_allclose(a[blocks.block[held]], b[other.block[held]], rtol=1e-6)
     assert np.isfinite(ways.costs[0][blocks.block[held]]).any()
     path = ways.path(int(ways.total.argmin()))
-    taut = tightened(ways.blocks.lattice, path, ways.least)
-    kernels.use_native(False)
-    np.testing.assert_allclose(tightened(other_ways.blocks.lattice, path, ways.least), taut, atol=1e-12)
-    kernels.use_native(True)
+    taut = tightened(lattice, path, ways.least)
+    far = Solids(torch.full((1, 1, d), 1e6).double(), torch.ones(1, 1).double(), torch.zeros(1, 1, dtype=torch.bool))
+    np.testing.assert_allclose(tightened(replace(lattice, solids=(far,)), path, ways.least), taut, atol=1e-12)
     assert 2 <= len(taut) < len(path)
 
 
@@ -251,3 +249,17 @@ def test_gco_flies_around_walls_with_the_same_bits_alone_and_in_a_batch() -> Non
     from torchgco import judge
 
     assert bool(judge(problem, whole.U).reached.all())
+
+
+def test_without_a_compiler_no_way_is_found_in_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHGCO_CC", "none")
+    cells = np.zeros((30, 24), bool)
+    cells[14:16, :14] = True
+    problem = problem_in(cells, [0.5, 1.0], [2.5, 1.0], radius=0.1)
+    seen = scene_of(problem, torch.zeros(problem.B, problem.N, problem.m, dtype=torch.float64))
+    assert seen is not None
+    paths, found = Roadmap().paths(seen, 3)
+    assert not bool(found.any()) and bool((paths[:, :, 1:] == seen.goal[:, None, None]).all())
+    assert classes(paths, seen.obstacles).shape == paths.shape[:2]
+    with pytest.raises(NativeError, match="state the stages"):
+        shortest_way(DistanceField.of(OccupancyGrid(cells, [0.0, 0.0], 0.1)), 0.1, [0.5, 1.0], [2.5, 1.0])

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.reference.graph_search import TorchSearch, squares_from_segments
 from tests.reference.roadmap import cheapest_cost, path_length, point_along, segment_gap
 from tests.search.scenes import NONE, inflated
 from tests.slow import mostly
 from torchgco import InputError, compose
-from torchgco.obstacles.base import squares_from_segments
-from torchgco.roadmap.cheapest import Graph, TorchSearch
+from torchgco.roadmap.cheapest import Graph, GraphSearch, library_for
 from torchgco.roadmap.geometry import Scene, points_along
-from torchgco.roadmap.native import NativeSearch, library_for
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
 from torchgco.roadmap.scene import scene_of
 
@@ -149,7 +148,7 @@ def test_no_path_on_the_graph_is_cheaper(native: bool) -> None:
     search = TorchSearch(s.obstacles, margin)
     graph = Graph(points, near, search._lengths(points, near))
     if native:
-        search = NativeSearch(library_for(points), s.obstacles, margin)
+        search = GraphSearch(library_for(2), s.obstacles, margin)
     path, _, found = search.cheapest(graph, price)
     for b in range(3):
         p, (o, R) = points[b].numpy(), present(s, b)

@@ -10,10 +10,10 @@ import torch
 
 from tests.problems import quick_gco
 from tests.reference import boxes as brute_force
+from tests.reference.graph_search import searched_by_torch
 from tests.search.scenes import NONE, spheres
 from torchgco import Capsules, ControlBounds, Goal, Planar, Problem, QuadraticCost, QuadrotorPlanning, Spheres, judge
 from torchgco.base.tree import take
-from torchgco.kernels import use_native
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.roadmap.geometry import Inflated, Scene
@@ -54,11 +54,8 @@ def bound(parts: tuple[np.ndarray, ...]) -> Cuboids:
 def test_paths_through_a_forest_are_free_and_the_same_in_c_and_in_pytorch(tilt: float) -> None:
     scene, (starts, ends, radii) = trunks(B=4, K=40, tilt=tilt)
     paths, found = Roadmap().paths(scene, 2)
-    use_native(False)
-    try:
+    with searched_by_torch():
         slow_paths, slow_found = Roadmap().paths(scene, 2)
-    finally:
-        use_native(True)
     assert bool(found.all()) and torch.equal(found, slow_found)
     torch.testing.assert_close(paths, slow_paths, rtol=0, atol=1e-12)
     for b in range(4):

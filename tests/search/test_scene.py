@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchgco import ControlBounds, Goal, Planar, Problem, QuadraticCost, Spheres
-from torchgco.roadmap.native import directions
+from torchgco.roadmap.points import directions
 from torchgco.roadmap.scene import scales, scene_of
 
 

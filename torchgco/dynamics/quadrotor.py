@@ -72,12 +72,25 @@ class Airframe:
         if self.thrust_max <= self.hover_thrust:
             raise InputError("airframe.thrust_max", f"more {weight}", self.thrust_max)
 
-    def slowed(self, pose: Components, v: Components) -> Components:
-        """The rates of `pose_rates` with the drag on the velocity v."""
-        if self.drag == 0:
-            return pose
-        loss = self.drag / self.mass
-        return (*pose[:3], *(a - loss * v_i for a, v_i in zip(pose[3:6], v, strict=True)), *pose[6:])
+    def pose_rates(self, v: Components, q: Components, w: Components, a: Tensor) -> Components:
+        """p' (3), v' (3) and q' (4) under a thrust acceleration a, m/s^2.
+
+        p' = v,  v' = a R(q) e3 - g e3 - drag v / mass,  q' = 1/2 Qx(w) q
+        """
+        (q0, q1, q2, q3), (w1, w2, w3) = q, w
+        axis = 2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
+        rates = a * axis[0], a * axis[1], a * axis[2] - self.gravity
+        if self.drag != 0:
+            loss = self.drag / self.mass
+            rates = tuple(rate - loss * v_i for rate, v_i in zip(rates, v, strict=True))
+        return (
+            *v,
+            *rates,
+            -0.5 * (q1 * w1 + q2 * w2 + q3 * w3),
+            0.5 * (q0 * w1 + q2 * w3 - q3 * w2),
+            0.5 * (q0 * w2 - q1 * w3 + q3 * w1),
+            0.5 * (q0 * w3 + q1 * w2 - q2 * w1),
+        )
 
     @property
     def hover_thrust(self) -> float:
@@ -156,22 +169,6 @@ def _apply(A: Tensor, x: Tensor) -> Tensor:
     return (A * x.unsqueeze(-2)).sum(-1)
 
 
-def pose_rates(v: Components, q: Components, w: Components, a: Tensor, gravity: float) -> Components:
-    """p' = v (3), v' = a R(q) e3 - g e3 (3) and q' = 1/2 Qx(w) q (4) under a thrust acceleration a, m/s^2."""
-    (q0, q1, q2, q3), (w1, w2, w3) = q, w
-    axis = 2 * (q1 * q3 + q0 * q2), 2 * (q2 * q3 - q0 * q1), q0 * q0 - q1 * q1 - q2 * q2 + q3 * q3
-    return (
-        *v,
-        a * axis[0],
-        a * axis[1],
-        a * axis[2] - gravity,
-        -0.5 * (q1 * w1 + q2 * w2 + q3 * w3),
-        0.5 * (q0 * w1 + q2 * w3 - q3 * w2),
-        0.5 * (q0 * w2 - q1 * w3 + q3 * w1),
-        0.5 * (q0 * w3 + q1 * w2 - q2 * w1),
-    )
-
-
 @dataclass(frozen=True)
 class QuadrotorPlanning(Dynamics, named="quadrotor"):
     """Planning model: x = [p (m), v (m/s), q, w (rad/s), a (m/s^2)], u = [w_c, a_c], n = 14, m = 4 (section 5.2).
@@ -216,8 +213,7 @@ class QuadrotorPlanning(Dynamics, named="quadrotor"):
         v, q, w, a = states[3:6], states[6:10], states[10:13], states[13]
         T_w, T_a = (lead(T, a) for T in (self.rate_time_constant, self.thrust_time_constant))
         turning = ((w_c - w_i) / T_w for w_c, w_i in zip(controls[:3], w, strict=True))
-        pose = self.airframe.slowed(pose_rates(v, q, w, a, self.airframe.gravity), v)
-        return vectors(*pose, *turning, (controls[3] - a) / T_a)
+        return vectors(*self.airframe.pose_rates(v, q, w, a), *turning, (controls[3] - a) / T_a)
 
     def settled(self, x: Tensor) -> Tensor:
         return with_unit_quaternion(x)
@@ -249,8 +245,7 @@ class QuadrotorPlant(Dynamics, named="plant"):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
         lift = F.sum(-1) / self.airframe.mass
-        pose = pose_rates(components(v), components(q), components(w), lift, self.airframe.gravity)
-        pose = self.airframe.slowed(pose, components(v))
+        pose = self.airframe.pose_rates(components(v), components(q), components(w), lift)
         rates = self.airframe.angular_acceleration(w, F, u), self.airframe.thrust_rate(F, u)
         return torch.cat((vectors(*pose), *rates), dim=-1)
 
@@ -265,10 +260,8 @@ class QuadrotorPlant(Dynamics, named="plant"):
 
 def within_limits(x: Tensor, airframe: Airframe) -> Tensor:
     """States (..., 17) with thrusts limited to [f_min, f_max] and a renormalised quaternion."""
-    q = x[..., 6:10]
-    q = q / q.square().sum(-1, keepdim=True).sqrt()
     F = x[..., 13:].clamp(airframe.thrust_min, airframe.thrust_max)
-    return torch.cat((x[..., :6], q, x[..., 10:13], F), dim=-1)
+    return torch.cat((with_unit_quaternion(x[..., :13]), F), dim=-1)
 
 
 def with_unit_quaternion(x: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torchgco.base.options import Seconds
 from torchgco.base.shapes import components, vectors
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import Integrator
-from torchgco.dynamics.quadrotor import POSE, POSE_UNITS, THRUSTS, Airframe, Limits, Texts, pose_rates
+from torchgco.dynamics.quadrotor import POSE, POSE_UNITS, THRUSTS, Airframe, Limits, Texts
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,5 @@ class QuadrotorThrusts(Dynamics, named="quadrotor"):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, v, q, w = x.split((3, 3, 4, 3), dim=-1)
         lift = u.sum(-1) / self.airframe.mass / q.square().sum(-1)
-        pose = pose_rates(components(v), components(q), components(w), lift, self.airframe.gravity)
-        pose = self.airframe.slowed(pose, components(v))
+        pose = self.airframe.pose_rates(components(v), components(q), components(w), lift)
         return torch.cat((vectors(*pose), self.airframe.angular_acceleration(w, u)), dim=-1)

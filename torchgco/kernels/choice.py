@@ -33,7 +33,8 @@ def use_native(on: bool) -> None:
     """Use native kernels where they can be used (the default), or PyTorch's everywhere, in this process.
 
     Native kernels solve several problems side by side; PyTorch's are the reference for them: the two differ in the last
-    bits. `device.kernels` chooses for a study.
+    bits. What evaluates no function of the problem, as the search for paths, is C in either case. `device.kernels`
+    chooses for a study.
     """
     global _uses_native
     _uses_native = on

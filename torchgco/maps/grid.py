@@ -126,12 +126,7 @@ class OccupancyGrid:
         if max(abs(turn.x), abs(turn.y), abs(turn.z)) > NO_TURN:
             expected = "an origin that isn't turned; `read` turns grids of bags"
             raise InputError("grid.message", expected, f"a quaternion with {turn.x:g}, {turn.y:g}, {turn.z:g}")
-        data = data.astype(np.int8) if data.dtype.kind in "iu" else data
-        if data.shape != (shape[0] * shape[1],) or data.dtype.kind != "i" or (data > 100).any():
-            expected = f"{shape[0]} x {shape[1]} whole numbers from -1 to 100"
-            raise InputError("grid.message", expected, f"{data.dtype} of shape {data.shape}")
-        cells = np.where(data < 0, np.float32("nan"), data.astype(np.float32) / np.float32(100.0))
-        return cls(cells.reshape(shape).T, [position.x, position.y], info.resolution)
+        return cls(values_of_ros(data, shape), [position.x, position.y], info.resolution)
 
     @property
     def d(self) -> int:
@@ -203,6 +198,19 @@ class OccupancyGrid:
         batch = "" if self.batch is None else f"{self.batch} of "
         cells = " x ".join(map(str, self.shape))
         return f"OccupancyGrid({batch}{cells} cells of {self.resolution:g} m)"
+
+
+def values_of_ros(data: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The probabilities (X, Y), NaN where unknown, that a nav_msgs/OccupancyGrid of height and width holds as percent.
+
+    Raises:
+        InputError: data of another length, or out of its range.
+    """
+    data = data.astype(np.int8) if data.dtype.kind in "iu" else data
+    if data.shape != (shape[0] * shape[1],) or data.dtype.kind != "i" or ((data < -1) | (data > 100)).any():
+        expected = f"{shape[0]} x {shape[1]} whole numbers from -1 to 100"
+        raise InputError("grid.message", expected, f"{data.dtype} of shape {data.shape}")
+    return np.where(data < 0, np.float32("nan"), data / np.float32(100.0)).reshape(shape).T
 
 
 def number(value: Any, field: str) -> float:

@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation  # before drone_models, which would import SciPy in its array API mode
 from torch import Tensor
 
-from torchgco.base.errors import InputError
+from torchgco.base.extras import imported
 from torchgco.dynamics.integrators import rk4
 from torchgco.dynamics.quadrotor import Airframe, within_limits
 from torchgco.missions.plant import RotorPlant, column
@@ -115,12 +115,9 @@ def _dynamics() -> Callable[..., tuple[np.ndarray, ...]]:
     before = os.environ.get("SCIPY_ARRAY_API")
     os.environ["SCIPY_ARRAY_API"] = "1"
     try:
-        from drone_models.first_principles import dynamics
-    except ImportError as error:
-        raise InputError("plant", "drone-models (`pip install torchgco[plants]`)", error) from None
+        return imported("drone_models.first_principles", "plants", "plant", "drone-models").dynamics
     finally:
         if before is None:
             del os.environ["SCIPY_ARRAY_API"]
         else:
             os.environ["SCIPY_ARRAY_API"] = before
-    return dynamics

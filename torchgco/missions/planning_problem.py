@@ -14,7 +14,7 @@ from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, pose_rates
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.dynamics.rotors import QuadrotorThrusts
 from torchgco.kernels import current, open_loop
 from torchgco.missions.constraints import FirstStepRates
@@ -85,8 +85,7 @@ def acceleration(x: Tensor, airframe: Airframe) -> Tensor:
     """v' (B, 3) of the planning model for plants x (B, 17), m/s^2."""
     _, v, q, w, F = x.split((3, 3, 4, 3, 4), dim=-1)
     lift = F.sum(-1) / airframe.mass
-    pose = pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift, airframe.gravity)
-    return torch.stack(airframe.slowed(pose, v.unbind(-1))[3:6], dim=-1)
+    return torch.stack(airframe.pose_rates(v.unbind(-1), q.unbind(-1), w.unbind(-1), lift)[3:6], dim=-1)
 
 
 @dataclass(frozen=True)

@@ -54,17 +54,10 @@ class Solids:
         """Those present with radii that are larger by lengths (B,), m."""
         return replace(self, radii=torch.where(self.absent, self.radii, self.radii + by.unsqueeze(-1)))
 
-    def squares(self, points: Tensor) -> Tensor:
-        """Squared distances (B, V, M) of points (B, V, d) from the solids before they are grown; 0 inside."""
-        return squares(points, self.centers)
-
-    def squares_from_segments(self, a: Tensor, b: Tensor) -> Tensor:
-        """Smallest squared distances (B, E, M) of the segments from a to b (B, E, d); 0 for those that enter."""
-        return squares_from_segments(self.centers, a, b)
-
     def signed_distance(self, points: Tensor) -> Tensor:
         """Distances (B, V, M) of points (B, V, d) from the grown surfaces, m; negative inside."""
-        return self.squares(points).sqrt_() - self.radii.unsqueeze(1)
+        apart = (points.unsqueeze(2) - self.centers.unsqueeze(1)).square_().sum(-1)
+        return apart.sqrt_() - self.radii.unsqueeze(1)
 
     def deeper(self, points: Tensor, than: Tensor) -> Tensor:
         """Whether points (B, V, d) lie deeper than lengths (B,) >= 0, m, beneath the surface of one present, (B, V)."""
@@ -364,18 +357,3 @@ def places_of(kept: Tensor) -> Tensor:
 def marked(lengths: Tensor, absent: Tensor) -> Tensor:
     """Lengths or squares (B, M) as C reads them: `ABSENT` stands for those of absent obstacles."""
     return torch.where(absent, ABSENT, lengths)
-
-
-def squares(a: Tensor, b: Tensor) -> Tensor:
-    """|a_i - b_j|^2 (B, V, W) of points (B, V, d), (B, W, d)."""
-    return (a.unsqueeze(2) - b.unsqueeze(1)).square_().sum(-1)
-
-
-def squares_from_segments(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Squared distances (B, E, V) of points (B, V, d) from segments a to b (B, E, d)."""
-    along = b - a
-    inverse = 1.0 / along.square().sum(-1, keepdim=True).clamp(min=TINY)
-    # Coordinate by coordinate and in place: these are the largest arrays of the search.
-    axes = [(along[..., i, None], points[:, None, :, i] - a[..., i, None]) for i in range(a.shape[-1])]
-    share = reduce(torch.add, (toward * step for step, toward in axes)).mul_(inverse).clamp_(0.0, 1.0)
-    return reduce(torch.add, (toward.sub_(share * step).square_() for step, toward in axes))

@@ -51,14 +51,6 @@ class Cuboids(Solids):
         """Half the side lengths, d tensors (B, 1, M)."""
         return list(self.half_sizes.unsqueeze(1).unbind(-1))
 
-    def squares(self, points: Tensor) -> Tensor:
-        return _square(excess(self.seen_from(points), self.halves()))
-
-    def squares_from_segments(self, a: Tensor, b: Tensor) -> Tensor:
-        begin, half = self.seen_from(a), self.halves()
-        along = self.local([(b - a)[..., None, j] for j in range(a.shape[-1])])
-        return _square(excess(at_share(begin, along, nearest(begin, along, half)), half))
-
     def signed_distance(self, points: Tensor) -> Tensor:
         return self.distance_at(self.seen_from(points))
 

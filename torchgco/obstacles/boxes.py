@@ -9,14 +9,23 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number, numbers, present
 from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.base.tree import take
 from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.obstacles.base import ABSENT, BOUND_SLACK, OwnKind, copied, marked, picked
 from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.obstacles.inputs import dimension, is_body, own_axes, own_radii, points, rows, vehicle_radii
+from torchgco.obstacles.inputs import (
+    check_absent,
+    check_sides,
+    dimension,
+    is_body,
+    own_axes,
+    own_radii,
+    points,
+    rows,
+    vehicle_radii,
+)
 from torchgco.obstacles.measured import Distances, box_distances
 
 BOX_GAPS_AT_ONCE = 2**17  # distances computed together: the intermediate results of more leave the processor's cache
@@ -64,16 +73,11 @@ class Boxes(Constraint):
         centers, absent = points(self.centers, "boxes.centers", d, dims)
         half = rows(self.half_sizes, "boxes.half_sizes", d, dims)
         check_shape(half, tuple(centers.shape), "boxes.half_sizes")
-        if bool((absent.unsqueeze(-1) != torch.isnan(half)).any()):
-            raise InputError("boxes.half_sizes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        check_absent(torch.isnan(half), absent.unsqueeze(-1), "boxes.half_sizes", "the centre is NaN")
         radii = torch.zeros_like(half[..., 0])
         if self.radii is not None:
             radii = own_radii(self.radii, "boxes.radii", absent, dims)
-        sized = torch.where(radii.unsqueeze(-1) > 0, half >= 0, half > 0) & torch.isfinite(half)
-        wrong = ~sized.all(-1) & ~absent
-        if bool(wrong.any()):
-            expected = "finite half sides above 0 m; 0 m too where the box is rounded"
-            raise InputError("boxes.half_sizes", expected, half[wrong][0].tolist())
+        check_sides(half, radii, absent, "boxes.half_sizes")
         axes = own_axes(self.rotations, "boxes.rotations", absent, d, dims)
         return BoundBoxes.prepare(self, "boxes", dims, centers, half, axes, absent, radii)
 

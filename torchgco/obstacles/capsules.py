@@ -13,7 +13,7 @@ from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.box_geometry import from_quaternions
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.inputs import dimension, is_body, own_radii, points
+from torchgco.obstacles.inputs import check_absent, dimension, is_body, own_radii, points
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,7 @@ class Capsules(Constraint):
         starts, absent = points(self.starts, "capsules.starts", d, dims)
         ends, gone = points(self.ends, "capsules.ends", d, dims)
         check_shape(ends, tuple(starts.shape), "capsules.ends")
-        if bool((gone != absent).any()):
-            raise InputError("capsules.ends", "NaN exactly where the start is NaN", "NaN and numbers mixed")
+        check_absent(gone, absent, "capsules.ends", "the start is NaN")
         radii = own_radii(self.radii, "capsules.radii", absent, dims)
         if bool((radii[~absent] == 0).any()):
             raise InputError("capsules.radii", "radii above 0 m", 0.0)

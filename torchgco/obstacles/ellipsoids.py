@@ -20,7 +20,16 @@ from torchgco.base.shapes import Dimensions, check_shape
 from torchgco.constraints.base import Constraint, resolve_knots
 from torchgco.obstacles.base import ABSENT, OwnKind, copied, least, picked
 from torchgco.obstacles.box_geometry import Cuboids
-from torchgco.obstacles.inputs import dimension, is_body, own_axes, own_velocities, points, rows, vehicle_radii
+from torchgco.obstacles.inputs import (
+    check_absent,
+    dimension,
+    is_body,
+    own_axes,
+    own_velocities,
+    points,
+    rows,
+    vehicle_radii,
+)
 from torchgco.obstacles.measured import Distances, along_ways
 
 REACH_STEPS = 3  # towards h; what they leave is told in `Ellipsoids`
@@ -73,8 +82,7 @@ class Ellipsoids(Constraint):
         semi = rows(self.semi_axes, "ellipsoids.semi_axes", d, dims)
         check_shape(semi, tuple(centers.shape), "ellipsoids.semi_axes")
         gone = absent.unsqueeze(-1)
-        if bool((gone != torch.isnan(semi)).any()):
-            raise InputError("ellipsoids.semi_axes", "NaN exactly where the centre is NaN", "NaN and numbers mixed")
+        check_absent(torch.isnan(semi), gone, "ellipsoids.semi_axes", "the centre is NaN")
         wrong = ~((semi > 0) & torch.isfinite(semi)).all(-1) & ~absent
         if bool(wrong.any()):
             raise InputError("ellipsoids.semi_axes", "finite semi-axes above 0 m", semi[wrong][0].tolist())

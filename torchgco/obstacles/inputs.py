@@ -67,12 +67,26 @@ def own_radii(value: Any, name: str, absent: Tensor, dims: Dimensions) -> Tensor
     values = tensor(value, name, dims.like)
     values = torch.where(absent, torch.nan, values) if values.dim() == 0 else values
     radii = per_row(values, name, dims, absent.shape[1])
-    if bool((torch.isnan(radii) != absent).any()):
-        raise InputError(name, "NaN exactly where the obstacle is absent", "NaN and numbers mixed")
+    check_absent(torch.isnan(radii), absent, name, "the obstacle is absent")
     wrong = ~absent & ~((radii >= 0) & torch.isfinite(radii))
     if bool(wrong.any()):
         raise InputError(name, "finite radii of at least 0 m", float(radii[wrong][0]))
     return torch.where(absent, 0.0, radii)
+
+
+def check_absent(missing: Tensor, absent: Tensor, name: str, where: str) -> None:
+    """Raise InputError unless numbers are NaN exactly where obstacles are absent."""
+    if bool((missing != absent).any()):
+        raise InputError(name, f"NaN exactly where {where}", "NaN and numbers mixed")
+
+
+def check_sides(half: Tensor, radii: Tensor, absent: Tensor, name: str) -> None:
+    """Raise InputError where half sides (B, M, d) of boxes with radii (B, M) aren't finite, or 0 without a radius."""
+    sized = torch.where(radii.unsqueeze(-1) > 0, half >= 0, half > 0) & torch.isfinite(half)
+    wrong = ~sized.all(-1) & ~absent
+    if bool(wrong.any()):
+        expected = "finite half sides above 0 m; 0 m too where the box is rounded"
+        raise InputError(name, expected, half[wrong][0].tolist())
 
 
 def vehicle_radii(value: Any, name: str, dims: Dimensions) -> Tensor:

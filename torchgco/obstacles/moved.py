@@ -18,7 +18,7 @@ from torchgco.base.shapes import Dimensions, check_shape, tensor
 from torchgco.constraints.base import Constraint, Lowered
 from torchgco.obstacles.base import ABSENT, copied, marked, picked
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.obstacles.inputs import dimension, is_body, own_axes, own_radii, rows
+from torchgco.obstacles.inputs import check_sides, dimension, is_body, own_axes, own_radii, rows
 from torchgco.obstacles.measured import Distances, box_distances, sphere_distances
 from torchgco.obstacles.moving_boxes import MovingBoxes
 from torchgco.obstacles.shapes import RoundedBoxes, array
@@ -64,7 +64,9 @@ class Moved(Constraint):
         radii = own_radii(self.radii, "moved.radii", absent, dims)
         half = torch.zeros_like(path[:, 0])
         if self.half_sizes is not None:
-            half = _half_sizes(self.half_sizes, absent, radii, dims)
+            half = rows(self.half_sizes, "moved.half_sizes", path.shape[-1], dims)
+            check_shape(half, (*absent.shape, path.shape[-1]), "moved.half_sizes")
+            check_sides(half, radii, absent, "moved.half_sizes")
         elif self.rotations is not None:
             raise InputError("moved.rotations", "half_sizes of boxes, which they turn", "spheres")
         axes = own_axes(self.rotations, "moved.rotations", absent, path.shape[-1], dims)
@@ -174,20 +176,3 @@ def _places(value: Any, d: int, dims: Dimensions) -> tuple[Tensor, Tensor]:
         got = f"{path[b, k, i].tolist()} of obstacle {i} at knot {k} of problem {b}"
         raise InputError("moved.places", "finite places at all knots, or NaN at all of them", got)
     return torch.where(absent[:, None, :, None], 0.0, path).contiguous(), absent
-
-
-def _half_sizes(value: Any, absent: Tensor, radii: Tensor, dims: Dimensions) -> Tensor:
-    """Half sides (B, M, d) as of rounded boxes, NaN where absent ones have it.
-
-    Raises:
-        InputError: another shape, sides that are negative, infinite, or 0 without a radius.
-    """
-    d = dimension(dims, "moved.half_sizes")
-    half = rows(value, "moved.half_sizes", d, dims)
-    check_shape(half, (*absent.shape, d), "moved.half_sizes")
-    sized = torch.where(radii.unsqueeze(-1) > 0, half >= 0, half > 0) & torch.isfinite(half)
-    wrong = ~sized.all(-1) & ~absent
-    if bool(wrong.any()):
-        expected = "finite half sides above 0 m; 0 m too where the box is rounded"
-        raise InputError("moved.half_sizes", expected, half[wrong][0].tolist())
-    return half

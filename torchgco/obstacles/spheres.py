@@ -60,11 +60,9 @@ class Spheres(Constraint):
         velocities = own_velocities(self.velocities, "obstacles.velocities", absent, dims)
         centers = torch.where(absent.unsqueeze(-1), 0.0, centers)
         inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
-        knots, dt = (
-            resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from),
-            dims.dt or 0.0,
-        )
-        return BoundSpheres.prepare(centers, inflated, velocities, absent, vehicle, knots, dims.position, dt)
+        knots = resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from)
+        at, dt = dims.position, dims.dt or 0.0
+        return BoundSpheres.prepare(centers, inflated, velocities, absent, vehicle, knots, at, dt)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The roadmap: points and paths around obstacles, one path per homotopy class.
 
 Geometry alone: `scene` is a problem as the search sees it, `roadmap.Roadmap` finds paths there, `homotopy` tells
-classes apart, `lattice` is the free space of maps. The search runs in C (`c/`) or in PyTorch (`search`). It imports
+classes apart, `lattice` is the free space of maps. The searches are C (`c/`). It imports
 `kernels`. Begin with `roadmap.py`.
 """
 

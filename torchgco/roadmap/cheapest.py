@@ -1,23 +1,27 @@
-"""The search of the roadmap in PyTorch: the counterpart of c/cheapest.c for every device and precision.
+"""The search of the roadmap in C (c/cheapest.c): each step is one call for all problems of a batch.
 
-Both return the same paths, even where several cost the same. Ties are broken by the lowest index, and no comparison
-depends on rounding: sums have a fixed order (there is no matrix product), clearance and nearness are compared as
-squares (PyTorch's square roots are not always correctly rounded), and detours and costs that differ by rounding alone
-are equal.
+Of paths that cost the same the first is taken, whatever compiler made the library: ties are broken by the lowest index,
+and no comparison depends on rounding. Sums have a fixed order, clearance and nearness are compared as squares, and
+detours and costs that differ by rounding alone are equal.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import ctypes
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-from torchgco.base.tree import take
-from torchgco.obstacles.base import Solids, squares, squares_from_segments
+from torchgco.native.declarations import Header, Structure
+from torchgco.native.engine import run
+from torchgco.obstacles.base import TINY, marked
+from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
-from torchgco.roadmap.points import around_spheres, between_spheres, of_boxes
+from torchgco.roadmap.library import C, library_of
+from torchgco.roadmap.points import CIRCLE, MIDWAY, SHELLS, directions, of_boxes
 
 HOPS = 64  # edges of a path, at most
 DIVERSITY = 1.0  # extra cost of later paths, as a share, next to an earlier one
@@ -25,8 +29,9 @@ LEAST_GAP = 0.001  # smallest gap between a point and all obstacles, as a share 
 TIE = 1e-12  # share of the cost by which equally cheap paths may differ
 EDGE_COST = 1e-6  # share of the distance from start to goal that is added to every edge: no edge may cost nothing
 UNIT = 1e-9  # m: the margin's unit is at least this
-CLASS = 8  # paths are drawn taut in groups: those of up to 8 edges, of up to 16, ...
-
+SEARCHES_AT_ONCE = 64  # problems searched together
+GROUP = 4  # of them, at least so many by each thread
+BLOCK, EDGES_AT_ONCE = 32, 8  # edges measured side by side; of those near a box, so many at once
 
 Beside: TypeAlias = tuple[Tensor, Tensor] | None  # points around boxes (B, C, d), and whether each exists (B, C)
 
@@ -39,15 +44,24 @@ class Graph(NamedTuple):
     lengths: Tensor  # (B, V, K), m: infinite where there is no edge
 
 
+class Arguments(Structure): ...
+
+
+SEARCH_HEADER = Header((C / "cheapest.h").read_text())
+SEARCH_HEADER.declare(Arguments)
+
+
 @dataclass(frozen=True)
-class TorchSearch:
-    """Graphs between obstacles and the cheapest paths over them, B problems.
+class GraphSearch:
+    """Graphs between obstacles and the cheapest paths over them, B problems on the CPU in float64.
 
     Args:
+        library: of `library_for`.
         obstacles: spheres and boxes.
         margin: distance from an obstacle, as a share of the largest size, below which an edge costs more.
     """
 
+    library: ctypes.CDLL
     obstacles: Inflated
     margin: float
 
@@ -64,18 +78,24 @@ class TorchSearch:
             neighbours, hubs: edges of a point to its nearest of all points and of the spread points.
             beside: `points.of_boxes`, where it is known.
         """
-        low, high = (end.unsqueeze(1) for end in self.obstacles.region(start, goal))
-        given = torch.cat((torch.stack((start, goal), dim=1), low + cube * (high - low)), dim=1)
-        kept, taken = self._beside(start, goal, nodes, beside)
-        points, free = torch.cat((given, kept), dim=1), torch.cat((self._is_free(given), taken), dim=1)
-        free[:, :2] = True
-        apart = squares(points, points).masked_fill(~free.unsqueeze(1), torch.inf)
-        apart.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-        near = _lowest(apart, neighbours), _lowest(apart[..., : 2 + len(cube)], hubs)
-        ends = torch.cat((*near, torch.ones_like(near[0][..., :1])), dim=-1)  # point 1 is the goal
-        joined = free.unsqueeze(-1) & torch.isfinite(apart.gather(2, ends))
-        joined[..., -1] = free
-        return Graph(points, ends, torch.where(joined, self._lengths(points, ends), torch.inf))
+        (B, d), (spheres, boxes, _) = start.shape, self.obstacles
+        M = spheres.radii.shape[1]
+        rays, shell = directions(start, goal), start.new_tensor(SHELLS[d])
+        count, more = M * (CIRCLE * len(shell) + min(MIDWAY, M)), {}
+        reach = torch.stack(self.obstacles.region(start, goal), dim=1)
+        if boxes is not None:
+            more["beside"], more["exists"] = beside or of_boxes(boxes, spheres, start, goal)
+            count += more["beside"].shape[1]
+        V, K = 2 + len(cube) + min(nodes, count), neighbours + hubs + 1
+        made = Graph(start.new_empty(B, V, d), torch.empty(B, V, K, dtype=torch.int32), start.new_empty(B, V, K))
+        self._run(
+            "tgco_graph",
+            {"start": start, "goal": goal, "reach": reach, "cube": cube, "rays": rays, "shell": shell, **more},
+            {"nodes": made.points, "ends": made.ends, "lengths": made.lengths},
+            spread=len(cube), candidates=count, points=V, edges=K, neighbours=neighbours, hubs=hubs, directions=CIRCLE,
+            shells=len(shell), midway=MIDWAY, extras=more["beside"].shape[1] if more else 0,
+        )  # fmt: skip
+        return made
 
     def cheapest(self, graph: Graph, price: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The cheapest paths from point 0 to point 1, by Bellman and Ford's algorithm on all edges at once.
@@ -88,30 +108,15 @@ class TorchSearch:
             edges. Points (B, 2 HOPS + 1, d): start, goal, then in turn the middles of the edges and the other corners.
             Whether there is a path (B,).
         """
-        points, ends, lengths = graph
-        edges = lengths * 0.5 * (price.unsqueeze(-1) + _rows(price, ends))
-        edges = torch.where(edges < torch.inf, edges, torch.inf)  # a price of NaN removes the edge
-        cost = torch.full_like(price, torch.inf)
-        cost[:, 1] = 0.0
-        through = edges + _rows(cost, ends)
-        for _ in range(HOPS):
-            before, cost = cost, torch.minimum(cost, through.amin(-1))
-            if torch.equal(before, cost):
-                break  # further rounds would change nothing
-            through = edges + _rows(cost, ends)
-        best = through.amin(-1, keepdim=True)
-        first = (through <= best + TIE * best.abs()).to(torch.uint8).argmax(-1, keepdim=True)
-        following = ends.gather(2, first).squeeze(-1)
-        following[:, 1] = 1
-        stops = [torch.zeros_like(following[:, :1])]
-        for _ in range(HOPS):
-            stops.append(following.gather(1, stops[-1]))
-        arrives = torch.isfinite(cost[:, 0]) & (stops[-1][:, 0] == 1)
-        straight = torch.ones_like(stops[0]).expand(-1, HOPS + 1).clone()
-        straight[:, 0] = 0
-        path = _rows(points, torch.where(arrives.unsqueeze(-1), torch.cat(stops, dim=1), straight))
-        between = torch.stack((0.5 * (path[:, :-1] + path[:, 1:]), path[:, 1:]), dim=2).flatten(1, 2)
-        return path, torch.cat((path[:, :1], path[:, -1:], between[:, :-1]), dim=1), arrives
+        (B, V, K), p, P = graph.ends.shape, graph.points, HOPS + 1
+        path, string = p.new_empty(B, P, p.shape[2]), p.new_empty(B, 2 * P - 1, p.shape[2])
+        arrives, ends = torch.zeros(B, dtype=torch.bool), graph.ends.to(torch.int32)
+        self._run(
+            "tgco_cheapest",
+            {"nodes": graph.points, "ends": ends, "lengths": graph.lengths, "price": self._prices(price, V)},
+            {"path": path, "string": string, "arrives": arrives}, points=V, edges=K,
+        )  # fmt: skip
+        return path, string, arrives
 
     def taut(self, path: Tensor, string: Tensor, price: Tensor) -> Tensor:
         """The cheapest path over a path's own corners and the points between them, all joined: a taut string.
@@ -121,79 +126,51 @@ class TorchSearch:
             string: the points that `cheapest` returned with it, (B, 2 HOPS + 1, d).
             price: cost per metre at the points of `string`, (B, 2 HOPS + 1).
         """
-        # All corners are joined to all, and paths grouped by length: short paths shouldn't pay for rare long ones.
-        edges = (path != path[:, -1:]).any(-1).sum(-1)
-        taut = path.clone()
-        for most in range(CLASS, HOPS + 1, CLASS):
-            part = ((edges > most - CLASS) & (edges <= most)).nonzero().flatten()
-            if part.numel() > 0:
-                search = replace(self, obstacles=take(self.obstacles, part))
-                points = string[part, : 2 * most + 1]
-                everyone = torch.arange(2 * most + 1, device=path.device).expand(*points.shape[:2], -1)
-                graph = Graph(points, everyone, search._lengths(points, everyone))
-                shorter, _, arrives = search.cheapest(graph, price[part, : 2 * most + 1])
-                taut[part] = torch.where(arrives.view(-1, 1, 1), shorter, path[part])
-        return taut
+        tight = path.clone()
+        self._run("tgco_taut", {"string": string, "cost": self._prices(price, string.shape[1])}, {"path": tight})
+        return tight
 
     def raised(self, price: Tensor, points: Tensor, path: Tensor, factor: float) -> Tensor:
         """Prices (B, V) times a factor at points that are nearer to a path than the largest radius."""
-        apart = squares_from_segments(points, path[:, :-1], path[:, 1:]).amin(1)
-        return torch.where(apart < _signed_square(self.obstacles.largest), factor * price, price)
+        V = points.shape[1]
+        price = self._prices(price, V).clone(memory_format=torch.contiguous_format)
+        self._run("tgco_raise", {"nodes": points, "path": path}, {"price": price}, points=V, factor=factor)
+        return price
 
-    def _beside(self, start: Tensor, goal: Tensor, nodes: int, beside: Beside) -> tuple[Tensor, Tensor]:
-        """Free points around the obstacles and between them (B, nodes, d), and which places are taken (B, nodes)."""
+    def _prices(self, price: Tensor, points: int) -> Tensor:
+        o = self.obstacles.spheres.centers
+        return price.to(o).expand(o.shape[0], points)
+
+    def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
+        """Call a function of the library on all problems, by as many threads as PyTorch uses."""
+        arguments = self._shared.copy()
+        arguments.fill({**{field: tensor.contiguous() for field, tensor in read.items()}, **written, **numbers})
+        run(getattr(self.library, name), self.obstacles.spheres.radii.shape[0], GROUP, arguments)
+
+    @cached_property
+    def _shared(self) -> Arguments:
+        """The arguments of all calls: the obstacles, and constants."""
         spheres, boxes, _ = self.obstacles
-        parts = [around_spheres(spheres, start, goal), between_spheres(spheres)]
+        M, more = spheres.radii.shape[1], {}
         if boxes is not None:
-            parts.append(beside or of_boxes(boxes, spheres, start, goal))
-        points, exists = (torch.cat(part, dim=1) for part in zip(*parts, strict=True))
-        detour = squares(points, torch.stack((start, goal), dim=1)).sqrt_().sum(-1)
-        detour = torch.where(exists & self._is_free(points), detour, torch.inf).to(torch.float32)
-        best = _lowest(detour, nodes)
-        taken = torch.isfinite(detour.gather(1, best))
-        return torch.where(taken.unsqueeze(-1), _rows(points, best), start.unsqueeze(1)), taken
-
-    def _is_free(self, points: Tensor) -> Tensor:
-        """Whether points (B, V, d) are clear of all obstacles by LEAST_GAP times the largest size."""
-        gap = LEAST_GAP * self.obstacles.largest
-        return torch.stack([_outside(part, part.squares(points), gap) for part in self.obstacles.kinds]).all(0)
-
-    def _lengths(self, points: Tensor, ends: Tensor) -> Tensor:
-        """Lengths (B, V, K) of the edges to the points `ends`, raised close to an obstacle, infinite through one."""
-        a = points.unsqueeze(2).expand(-1, -1, ends.shape[2], -1).flatten(1, 2)
-        b = _rows(points, ends.flatten(1))
-        free, gap = torch.ones_like(ends, dtype=torch.bool), torch.full_like(a[..., 0], torch.inf).view(ends.shape)
-        for part in self.obstacles.kinds:
-            away = part.squares_from_segments(a, b)
-            free = free & _outside(part, away).view(ends.shape)
-            left = away.sqrt_().sub_(part.radii.unsqueeze(1)).masked_fill_(part.absent.unsqueeze(1), torch.inf)
-            gap = torch.minimum(gap, left.amin(-1).view(ends.shape))
-        length = (b - a).square().sum(-1).sqrt().view(ends.shape)
-        # Every edge costs something: otherwise paths could circle among points that coincide.
-        length = length + EDGE_COST * (points[:, 1] - points[:, 0]).square().sum(-1).sqrt().view(-1, 1, 1)
-        margin = self.margin * self.obstacles.largest.clamp(min=UNIT).view(-1, 1, 1)
-        close = 1.0 + ((margin - gap) / margin).clamp(0.0, 1.0)
-        return torch.where(free, length * close, torch.inf)
+            more = {"boxes": boxes.radii.shape[1], "box": _numbers(boxes), "largest": boxes.sizes.amax(-1).contiguous()}
+        return Arguments(
+            spheres=M, corners=HOPS + 1, margin=self.margin, clear=LEAST_GAP, least=EDGE_COST, tie=TIE,
+            centers=spheres.centers.contiguous(), distances=marked(spheres.radii, spheres.absent).contiguous(), **more,
+        )  # fmt: skip
 
 
-def _lowest(values: Tensor, count: int) -> Tensor:
-    """Indices (..., count) of the lowest values in ascending order; of equal values the first."""
-    return values.sort(dim=-1, stable=True).indices[..., :count]
+def _numbers(boxes: Cuboids) -> Tensor:
+    """The numbers that C reads per box, (B, K, ...): centre, directions of its sides, half their lengths, radius."""
+    parts = boxes.centers, boxes.axes.flatten(-2), boxes.half_sizes, marked(boxes.radii, boxes.absent).unsqueeze(-1)
+    return torch.cat(parts, dim=-1)
 
 
-def _rows(values: Tensor, index: Tensor) -> Tensor:
-    """values[b, index[b, ...]] for values (B, V) or (B, V, d)."""
-    flat = index.flatten(1)
-    if values.dim() == 2:
-        return values.gather(1, flat).view(index.shape)
-    return values.gather(1, flat.unsqueeze(-1).expand(-1, -1, values.shape[-1])).view(*index.shape, values.shape[-1])
-
-
-def _outside(part: Solids, away: Tensor, gap: Tensor | float = 0.0) -> Tensor:
-    """Whether squared distances (B, V, M) from solids are over their radii and a gap (B, 1), of all of them (B, V)."""
-    return ((away > _signed_square(part.radii + gap).unsqueeze(1)) | part.absent.unsqueeze(1)).all(-1)
-
-
-def _signed_square(x: Tensor) -> Tensor:
-    """x |x|: a distance is below x where its square is below this, also for negative x."""
-    return x * x.abs()
+def library_for(dimension: int, boxes: bool = False) -> ctypes.CDLL | None:
+    """The library for spheres in space of this dimension, and boxes; None where there is none, see `library_of`."""
+    # Without boxes their code is left out, so that it can't change how the spheres' code is compiled.
+    constants = {
+        "DIM": dimension, "BOXES": int(boxes), "TINY": TINY, "SMALL": UNIT, "BLOCK": BLOCK, "REAL": "double",
+        "LANES": EDGES_AT_ONCE,
+    }  # fmt: skip
+    return library_of("cheapest.c", SEARCH_HEADER, constants, "no paths are sought")

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from torchgco.roadmap.native_maps import SURE_SPACINGS, Map, library_for, map_of
+from torchgco.roadmap.native_maps import SURE_SPACINGS, Map, call, map_of
 
 Nodes = NDArray[np.int64]
 Numbers = NDArray[np.float64]
@@ -53,21 +53,12 @@ class Clearances:
         numbers = {"core": self.core, "limit": self.limit, "smooth": int(self.smooth)}
         return map_of(self.values, self.low, self.size, spacing=self.spacing, **numbers)
 
-    def distances(self, nodes: Nodes) -> tuple[Numbers, Nodes, Numbers]:
-        """The field's distances (...) at nodes (..., d), m; the nodes held in the map; squared distances from there."""
-        place = nodes - self.low
-        held = np.clip(place, 0, np.array(self.values.shape) - 1)
-        beyond = ((place - held) ** 2).sum(-1) * (self.spacing * self.spacing)
-        return self.values[tuple(np.moveaxis(held, -1, 0))].astype(float), held, beyond
-
-    def raw(self, nodes: Nodes) -> Numbers:
-        """Clearances (...) at nodes (..., d) by the field's distances themselves, m: no less than `at`."""
-        distance, _, beyond = self.distances(nodes)
-        return np.where(beyond > 0, np.sqrt(np.maximum(distance, 0.0) ** 2 + beyond), distance) - self.limit
-
     def at(self, nodes: Nodes) -> Numbers:
         """Clearances (...) at nodes (..., d), m."""
-        distance, held, beyond = self.distances(nodes)
+        place = nodes - self.low
+        held = np.clip(place, 0, np.array(self.values.shape) - 1)
+        beyond = ((place - held) ** 2).sum(-1) * (self.spacing * self.spacing)  # from the map, m^2
+        distance = self.values[tuple(np.moveaxis(held, -1, 0))].astype(float)
         if self.smooth:
             near = distance < self.limit + SURE_SPACINGS * self.spacing
             distance[near] = self._interpolated(held[near])
@@ -89,15 +80,9 @@ class Clearances:
     @cached_property
     def everywhere(self) -> NDArray[np.float32]:
         """At all nodes."""
-        if (library := library_for(self.d)) is not None:
-            found = np.empty(self.size, np.float32)
-            library.tgco_measure(ctypes.byref(self.native), found.ctypes.data_as(ctypes.c_void_p))
-            return found
-        rows = np.indices(self.size[1:].tolist()).reshape(self.d - 1, -1).T
-        values = np.empty((int(self.size[0]), len(rows)), np.float32)
-        for i in range(self.size[0]):
-            values[i] = self.at(np.concatenate((np.full((len(rows), 1), i), rows), axis=1))
-        return values.reshape(self.size)
+        found = np.empty(self.size, np.float32)
+        call("tgco_measure", self.d, self.native, found.ctypes.data_as(ctypes.c_void_p))
+        return found
 
     @cached_property
     def rooms(self) -> NDArray[np.int32]:

@@ -9,7 +9,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.tree import take
+from torchgco.base.shapes import CPU, computing_on
+from torchgco.base.tree import cast, moved, take
 from torchgco.maps.field import BoundField
 from torchgco.obstacles.base import TINY, Solids
 from torchgco.obstacles.box_geometry import Cuboids
@@ -88,6 +89,25 @@ class Scene:
     obstacles: Inflated
     traversal_cost: Callable[[Tensor, Tensor], Tensor]  # per metre at points (B', V, d) of some problems, (B', V)
     gates: Tensor | None = None  # (B, G, d): which paths pass, in this order
+
+    def on_cpu(self) -> Scene:
+        """The same in double precision on the CPU, where C searches; what a metre costs is asked where problems lie."""
+        here = self.start
+        if here.dtype == torch.float64 and here.device.type == CPU.type:
+            return self
+        start, goal, obstacles, gates = moved(
+            cast((self.start, self.goal, self.obstacles, self.gates), torch.float64), CPU
+        )
+
+        def cost(points: Tensor, rows: Tensor) -> Tensor:
+            with computing_on(here.device):
+                return self.traversal_cost(points.to(here), rows.to(here.device)).double().cpu()
+
+        return Scene(start, goal, obstacles, cost, gates)
+
+    def straight(self, edges: int, count: int) -> Tensor:
+        """The straight line as `count` paths of each problem, (B, count, edges+1, d): the goal is repeated."""
+        return torch.stack((self.start, self.goal), dim=1)[:, [0, *[1] * edges]].unsqueeze(1).repeat(1, count, 1, 1)
 
     def take(self, rows: Tensor) -> Scene:
         """The same of some problems."""

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from torchgco.base.tree import take
-from torchgco.roadmap.cheapest import Graph, TorchSearch
+from torchgco.roadmap.cheapest import Graph, GraphSearch
 from torchgco.roadmap.geometry import Inflated, Scene
-from torchgco.roadmap.native import NativeSearch
 from torchgco.roadmap.points import of_boxes
 
 BYTES_KEPT = 2**26  # bytes of graphs and points that are kept for later searches in a scene
@@ -27,9 +26,7 @@ class Course:
         factor: of the price of points near a path, for those after it.
     """
 
-    def __init__(
-        self, scene: Scene, rows: Tensor, search: NativeSearch | TorchSearch, graph: Graph, factor: float
-    ) -> None:
+    def __init__(self, scene: Scene, rows: Tensor, search: GraphSearch, graph: Graph, factor: float) -> None:
         self.scene, self.rows, self.search, self.graph, self.factor = scene, rows, search, graph, factor
         self.price = scene.traversal_cost(graph.points, rows)  # (B', V)
         self.paths: list[Tensor] = []  # corners (B', HOPS+1, d) of each

@@ -17,13 +17,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchgco.base.shapes import computing_on
+from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import moved, take
 from torchgco.maps.ways import length
 from torchgco.roadmap.blocks import Blocks, blocks_of, tightened_by_c
 from torchgco.roadmap.cheapest import DIVERSITY, HOPS
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.lattice import Array, Lattice, lattice_of, sampled
+from torchgco.roadmap.native_maps import library_for
 
 # The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of
 # further searches where there is no path yet. Through gaps with less clearance than the nodes are apart no trajectory
@@ -45,8 +46,6 @@ PATH_STEPS = 0.5  # units between points at which it is looked for what is near 
 MAPPED_ROUNDING = 1e-9  # m
 REGION_SEED = 0x5DEECE66D  # seed of the numbers that stand for blocked regions
 
-CPU = torch.device("cpu")
-
 Price = Callable[[Array], Array]  # per metre at points (V, d)
 Search = Callable[[Lattice, Array, Price, float, float], list[Array]]  # with the vehicle's radius and the unit, m
 
@@ -58,12 +57,11 @@ def paths_in_maps(scene: Scene, count: int, overlap: float) -> tuple[Tensor, Ten
 
 def in_each(scene: Scene, count: int, overlap: float, search: Search) -> tuple[Tensor, Tensor]:
     """The paths (B, count, HOPS+1, d) that a search of each problem finds, and whether it finds any, (B,)."""
-    start, goal = scene.start, scene.goal
-    corners = torch.stack((start, goal), dim=1)[:, [0, *[1] * HOPS]].unsqueeze(1).repeat(1, count, 1, 1)
-    found = torch.zeros_like(start[:, 0], dtype=torch.bool)
-    for b in range(len(start)):
+    corners = scene.straight(HOPS, count)
+    found = torch.zeros_like(corners[:, 0, 0, 0], dtype=torch.bool)
+    for b in range(len(corners)):
         for k, path in enumerate(in_one(scene, b, overlap, search)):
-            corners[b, k, : len(path)] = start.new_tensor(path)
+            corners[b, k, : len(path)] = corners.new_tensor(path)
             if k == 0:
                 corners[b, 1:], found[b] = corners[b, :1], True  # the first stands in for those that there aren't
     return corners, found
@@ -71,15 +69,14 @@ def in_each(scene: Scene, count: int, overlap: float, search: Search) -> tuple[T
 
 def in_one(scene: Scene, b: int, overlap: float, search: Search) -> list[Array]:
     """What a search of the problem at place b finds."""
-    row = torch.tensor([b], device=scene.start.device)
-    obstacles = moved(take(scene.obstacles, row), CPU).reduced(overlap)
+    one = scene.take(torch.tensor([b], device=scene.start.device)).on_cpu()
+    obstacles = one.obstacles.reduced(overlap)
 
     def price(points: Array) -> Array:
-        with computing_on(scene.start.device):
-            return scene.traversal_cost(scene.start.new_tensor(points)[None], row)[0].double().cpu().numpy()
+        return one.traversal_cost(torch.from_numpy(points)[None], torch.tensor([0]))[0].numpy()
 
-    ends = torch.stack((scene.start[b], scene.goal[b])).double().cpu().numpy()
-    with computing_on(CPU):  # the search is of NumPy's arrays, wherever the problem lies
+    ends = torch.cat((one.start, one.goal)).numpy()
+    with computing_on(CPU):
         if obstacles.maps:
             lattice, radius = lattice_of(obstacles.maps, obstacles.kinds, ends), obstacles.maps[0].vehicle_radius
         else:
@@ -91,6 +88,8 @@ def in_one(scene: Scene, b: int, overlap: float, search: Search) -> list[Array]:
 def sweep_alike(paths: Tensor, obstacles: Inflated) -> Tensor:
     """Whether paths (B, K, P, 2) wind around every blocked region of the maps by the same angle, (B, K, K)."""
     same = torch.ones(*paths.shape[:2], paths.shape[1], dtype=torch.bool, device=paths.device)
+    if library_for(paths.shape[-1]) is None:
+        return same  # nothing was found: all are the straight line
     for b, some in enumerate(paths.double().cpu().numpy()):
         own = moved(take(obstacles, torch.tensor([b], device=paths.device)), CPU)
         for field in own.maps:
@@ -207,7 +206,9 @@ def paths(
 
 
 def ways_of(lattice: Lattice, ends: Array, price: Price, radius: float, margin: float) -> Ways | None:
-    """The ways of the first search that finds any; None where none does."""
+    """The ways of the first search that finds any; None where none does, and without a compiler."""
+    if library_for(lattice.d) is None:
+        return None
     for number, (most, share, merged) in enumerate(SEARCHES):
         if number == 1 and not lattice.may_join(ends):
             return None
@@ -371,9 +372,8 @@ def tightened(lattice: Lattice, path: Array, least: float, reach: float = np.inf
         reach: the longest segment, m: with one, corners are left out once.
     """
     rounds = TAUT_ROUNDS if reach == np.inf else 0
-    taut = tightened_by_c(lattice, path, least, reach, POINTS, rounds, LITTLE)
-    if taut is not None:
-        return taut
+    if lattice.alone:
+        return tightened_by_c(lattice, path, least, reach, POINTS, rounds, LITTLE)
     path = _shortcut(lattice, path, least, reach)
     step = max(2.0 * lattice.spacing, length(path) / POINTS)
     for _ in range(rounds):

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import ctypes
-import functools
-import warnings
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchgco.kernels import EagerWarning, native
-from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
-from torchgco.native.declarations import Header, Structure, defines
-from torchgco.native.includes import included, joined
+from torchgco.native.declarations import Header, Structure
+from torchgco.roadmap.library import C, library_of
 
 SURE_SPACINGS = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 WAY_PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at
-C = Path(__file__).parent / "c"
 
 
 # fmt: off
@@ -34,19 +29,16 @@ LATTICE_HEADER.declare(Map, Graph, Sweep, String)
 
 
 def library_for(d: int) -> ctypes.CDLL | None:
-    """The library for space of this dimension; None without a compiler, or where the process uses PyTorch's kernels."""
-    compiler = find_compiler()
-    return None if compiler is None or not native() else _library(d, compiler)
+    """The library for space of this dimension; None where there is none, see `library_of`."""
+    constants = {"DIM": d, "PARTS": WAY_PARTS, "SURE": SURE_SPACINGS}
+    return library_of("lattice.c", LATTICE_HEADER, constants, "no paths are sought in maps")
 
 
-@functools.cache
-def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
-    try:
-        text = defines({"DIM": d, "PARTS": WAY_PARTS, "SURE": SURE_SPACINGS}) + included("lattice.c")
-        return build(joined(text, C) + LATTICE_HEADER.layout)
-    except NativeError as error:
-        warnings.warn(f"paths in maps are sought by SciPy: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
-        return None
+def call(name: str, d: int, *arguments: Any) -> int:
+    """Call a function of the library, which must be there; structures are passed by their addresses."""
+    library = library_for(d)
+    assert library is not None
+    return getattr(library, name)(*(ctypes.byref(one) if isinstance(one, Structure) else one for one in arguments))
 
 
 def map_of(values: NDArray[np.float32], low: NDArray[np.int64], size: NDArray[np.int64], **numbers: float) -> Map:

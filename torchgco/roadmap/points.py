@@ -21,21 +21,6 @@ PROJECTIONS = 8  # projections from one box to the other and back; the two point
 PAIRS = 32768  # of boxes that are projected onto each other at once: their coordinates fit into the processor's cache
 
 
-def around_spheres(spheres: Solids, start: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (B, C, d) on circles around each sphere, and whether the sphere is present (B, C)."""
-    rays, shells = directions(start, goal).unsqueeze(1), SHELLS[start.shape[1]]
-    o, R = spheres.centers.unsqueeze(2), spheres.radii
-    points = [(o + (shell * R)[..., None, None] * rays).flatten(1, 2) for shell in shells]
-    return torch.cat(points, dim=1), (~spheres.absent).repeat_interleave(CIRCLE, dim=1).repeat(1, len(shells))
-
-
-def between_spheres(spheres: Solids) -> tuple[Tensor, Tensor]:
-    """The middles (B, C, d) of the gaps between spheres and their nearest, and whether both are present (B, C)."""
-    M, o, R = spheres.radii.shape[1], spheres.centers, spheres.radii
-    ends = o.unsqueeze(2).expand(-1, -1, M, -1), o.unsqueeze(1).expand(-1, M, -1, -1)
-    return _middles(*ends, R.unsqueeze(2), R.unsqueeze(1), _pairs(spheres))
-
-
 def directions(start: Tensor, goal: Tensor) -> Tensor:
     """Unit vectors (B, CIRCLE, d): all around in the plane, across the line from start to goal (B, d) in space."""
     angle = torch.arange(CIRCLE, dtype=start.dtype, device=start.device).view(-1, 1) * (2.0 * math.pi / CIRCLE)

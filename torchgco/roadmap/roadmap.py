@@ -1,8 +1,8 @@
 """Short paths between spheres and boxes over a graph of points: geometry alone, without time or controls.
 
 Points lie around every obstacle, midway between neighbours and, in a fixed low-discrepancy sequence, all over the
-scene; each is joined to a few near ones where the straight line is free. Nothing is random. The search runs in C
-(c/cheapest.c) or, where that can't serve, in PyTorch (cheapest.py), with the same result.
+scene; each is joined to a few near ones where the straight line is free. Nothing is random. C searches (c/cheapest.c),
+in double precision on the CPU wherever the problems lie; without a compiler no paths are found.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ import torch
 from torch import Tensor
 
 from torchgco.base.options import AtLeast, Below, check_options
+from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import take
-from torchgco.roadmap import native
-from torchgco.roadmap.cheapest import DIVERSITY, HOPS, TorchSearch
+from torchgco.roadmap import cheapest
+from torchgco.roadmap.cheapest import DIVERSITY, HOPS, GraphSearch
 from torchgco.roadmap.geometry import Scene, length
 from torchgco.roadmap.known import Course, Known
 from torchgco.roadmap.mapped import paths_in_maps
-from torchgco.roadmap.native import NativeSearch
 
-PROBLEMS_AT_ONCE = 4  # problems searched together by PyTorch: memory holds distances of all edges from all obstacles
 NODES = 128  # points around obstacles: those of the shortest detours
 # A second search has more points, where the first had no places for all of them and found no path, or only a long one
 # (in distances from start to goal): the points next to the straight line take all places, before any lies in the gaps
@@ -72,16 +71,23 @@ class Roadmap:
         """
         if scene.obstacles.maps:
             return paths_in_maps(scene if rows is None else scene.take(rows), count, self.max_overlap)
-        library = native.library_for(scene.start, scene.obstacles.boxes is not None)
-        most = PROBLEMS_AT_ONCE if library is None else native.SEARCHES_AT_ONCE
+        with computing_on(CPU):
+            corners, found = self._paths(scene.on_cpu(), count, None if rows is None else rows.cpu(), known or Known())
+        return corners.to(scene.start), found.to(scene.start.device)
+
+    def _paths(self, scene: Scene, count: int, rows: Tensor | None, known: Known) -> tuple[Tensor, Tensor]:
+        """The same without maps, on the CPU in double precision."""
         B, d = scene.start.shape
-        rows = torch.arange(B, device=scene.start.device) if rows is None else rows
-        place, found = torch.full((B,), -1, device=rows.device), torch.zeros_like(rows, dtype=torch.bool)
-        place[rows] = torch.arange(rows.numel(), device=rows.device)
-        corners = scene.start.new_empty(rows.numel(), count, HOPS + 1, d)
+        rows = torch.arange(B) if rows is None else rows
+        corners, found = scene.straight(HOPS, count)[rows], torch.zeros_like(rows, dtype=torch.bool)
+        library = cheapest.library_for(d, scene.obstacles.boxes is not None)
+        if library is None:
+            return corners, found
+        place, most = torch.full((B,), -1), cheapest.SEARCHES_AT_ONCE
+        place[rows] = torch.arange(rows.numel())
         for first in range(0, B, most):
             some = rows[(rows >= first) & (rows < first + most)]
-            for course in self._courses(scene, some, first, count, library, known or Known()):
+            for course in self._courses(scene, some, first, count, library, known):
                 corners[place[course.rows]] = torch.stack(course.paths[:count], dim=1)
                 found[place[course.rows]] = course.found
         if not bool(found.all()):
@@ -97,9 +103,7 @@ class Roadmap:
         """Whether another search finds the same paths: those among maps need no points all over the scene."""
         return bool(scene.obstacles.maps) and self.max_overlap == other.max_overlap
 
-    def _courses(
-        self, scene: Scene, rows: Tensor, group: int, count: int, library: CDLL | None, known: Known
-    ) -> list[Course]:
+    def _courses(self, scene: Scene, rows: Tensor, group: int, count: int, library: CDLL, known: Known) -> list[Course]:
         """Courses with `count` paths, or more, of the problems in `rows`, which are of one group."""
         if rows.numel() == 0:
             return []
@@ -111,13 +115,13 @@ class Roadmap:
             known.keep((self, group), courses)
         return courses
 
-    def _begun(self, scene: Scene, rows: Tensor, group: int, library: CDLL | None, known: Known) -> list[Course]:
+    def _begun(self, scene: Scene, rows: Tensor, group: int, library: CDLL, known: Known) -> list[Course]:
         """Courses with one path of the problems in `rows`, some of them over more points."""
 
         def begin(rows: Tensor, nodes: int, neighbours: int) -> Course:
             start, goal = scene.start[rows], scene.goal[rows]
             obstacles = take(scene.obstacles, rows).reduced(self.max_overlap)
-            search = TorchSearch(obstacles, MARGIN) if library is None else NativeSearch(library, obstacles, MARGIN)
+            search = GraphSearch(library, obstacles, MARGIN)
             cube = halton(self.num_halton, start.shape[-1]).to(start)
             beside = known.beside((self.max_overlap, group), rows, obstacles, scene)
             graph = search.graph(start, goal, cube, nodes, neighbours, HALTON_NEIGHBOURS, beside)

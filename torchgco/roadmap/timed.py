@@ -10,11 +10,8 @@ tell (compare de Groot et al., Topology-driven parallel trajectory optimization 
 from __future__ import annotations
 
 import ctypes
-import functools
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,20 +20,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchgco.base.tree import cast, is_users, moved
-from torchgco.kernels import EagerWarning, native
-from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
-from torchgco.native.declarations import Header, Structure, defines
+from torchgco.native.declarations import Header, Structure
 from torchgco.native.engine import run
-from torchgco.native.includes import included, joined
 from torchgco.obstacles.base import OwnKind, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.library import C, library_of
 
 PARTS = 3  # of a move, at whose ends it is looked at
 LOOKS = 16  # layers, about, in which ways of their own are sought
 TRIES = 400  # ways that are looked at for them
 FAR = 1e30  # costs that stand for none
-C = Path(__file__).parent / "c"
 
 
 class Timed(Structure): ...
@@ -253,16 +247,6 @@ def _away(parts: Sequence[Any], lattice: TimedLattice, times: Tensor) -> Tensor:
 
 
 def library_for(d: int) -> ctypes.CDLL | None:
-    """The library for space of this dimension; None without a compiler, or where the process uses PyTorch's kernels."""
-    compiler = find_compiler()
-    return None if compiler is None or not native() else _library(d, compiler)
-
-
-@functools.cache
-def _library(d: int, compiler: Compiler) -> ctypes.CDLL | None:
-    try:
-        text = defines({"DIM": d, "LOOKS": LOOKS, "FAR": f"{FAR:g}f"}) + included("timed.c")
-        return build(joined(text, C) + TIMED_HEADER.layout)
-    except NativeError as error:
-        warnings.warn(f"no ways are sought among what moves: {str(error).splitlines()[0]}", EagerWarning, stacklevel=3)
-        return None
+    """The library for space of this dimension; None where there is none, see `library_of`."""
+    constants = {"DIM": d, "LOOKS": LOOKS, "FAR": f"{FAR:g}f"}
+    return library_of("timed.c", TIMED_HEADER, constants, "no ways are sought among what moves")

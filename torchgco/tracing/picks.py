@@ -62,7 +62,17 @@ def picks_of(
         captured: all tensors that the function reads, but for its arguments.
         indexed: those that the index is applied to.
     """
-    if not _move_alone(operations, own, results, index, captured, indexed):
+    # Operations may only move numbers of the own tensors, in the rows that the index says or in a shared one.
+    if not own or any(name_of(op.function) not in PICKING for op in operations):
+        return None
+    if not followers(operations, own).issuperset(results):
+        return None
+    if indices(operations) & (followers(operations, [index, *own]) - {index}):
+        return None  # chosen by others
+    if any(tensor.dim() == 0 or (len(tensor) > 1 and slot not in indexed) for slot, tensor in own.items()):
+        return None
+    others = captured.keys() & {slot for op in operations for slot in op.inputs} - own.keys()
+    if any(slot.dtype.is_floating_point for slot in others):
         return None
     # Asked with the places themselves in the place of the numbers: those of problem i, i times their number later.
     ends = np.cumsum([0, *(math.prod(tensor.shape[1:]) for tensor in own.values())]).tolist()
@@ -87,24 +97,3 @@ def picks_of(
         return None
     expected = places[0] + total * torch.arange(PROBED).unsqueeze(-1) * of_problem[places[0]]
     return places[0] if torch.equal(places, expected) else None
-
-
-def _move_alone(
-    operations: list[Operation],
-    own: Mapping[Slot, Tensor],
-    results: Sequence[Slot],
-    index: Slot,
-    captured: Mapping[Slot, Tensor],
-    indexed: set[Slot],
-) -> bool:
-    """Whether operations only move numbers of `own` tensors, in the rows that the index says or in a shared one."""
-    if not own or any(name_of(op.function) not in PICKING for op in operations):
-        return False
-    if not followers(operations, own).issuperset(results):
-        return False
-    if indices(operations) & (followers(operations, [index, *own]) - {index}):
-        return False  # chosen by others
-    if any(tensor.dim() == 0 or (len(tensor) > 1 and slot not in indexed) for slot, tensor in own.items()):
-        return False
-    others = captured.keys() & {slot for op in operations for slot in op.inputs} - own.keys()
-    return not any(slot.dtype.is_floating_point for slot in others)

@@ -66,7 +66,7 @@ def test_fortran_order_and_other_numbers(tmp_path: Path) -> None:
     ("a.npy", b"", "an npy file"),
     ("a.npy", samples.npy(np.zeros(3)), "points \\(P, 2 or 3\\)"),
     ("a.npy", samples.npy(np.zeros((2, 3), complex)), "complex128"),
-    ("a.npy", samples.npy(np.zeros((4, 3)))[:-1], "96 bytes of numbers from byte 128, got .*95 bytes"),
+    ("a.npy", samples.npy(np.zeros((4, 3)))[:-1], "an npy file of numbers.*greater than file size"),
     ("a.pcd", b"VERSION 0.7\n", "none in line 2, byte 12"),
     ("a.pcd", samples.pcd("ascii").replace(b"FIELDS intensity x", b"FIELDS intensity u"), "fields intensity u y z rgb"),
     ("a.pcd", samples.pcd("ascii").replace(b"9 1.25", b"9 one"), "'9 one 3.0 -0.5 1 2 3' in line 13"),

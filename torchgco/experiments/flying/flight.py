@@ -25,10 +25,9 @@ from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
 from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
-from torchgco.experiments.results.durations import durations, with_lengths
+from torchgco.experiments.results.durations import judged_columns, with_lengths
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
-from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.kernels import use_native
 from torchgco.problem.problem import Problem
 from torchgco.scenarios import Layouts
@@ -162,7 +161,7 @@ class SolveBatch(Batch):
         """Rows (without success) and controls (L, N, m), NaN where nothing was flown.
 
         Layouts with as many stages and gates are solved together; their controls end with those at rest. Where the time
-        is free the lengths of the stages are a column more (`durations`).
+        is free the lengths of the stages are a column more (`with_lengths`).
         """
         groups = self.layouts.alike()
         flown = [self._fly(np.array(self.places)[rows]) for rows in groups]
@@ -198,13 +197,12 @@ class SolveBatch(Batch):
         checked = self.tasks.of(places, exact=True)
         free = checked.problem.time is not None
         times = solution.t.detach().to("cpu", torch.float64) if free else None
-        verdict = judge(checked.problem, U, checked.goal, checked.goal_radius, times=times)
+        verdict, columns = judged_columns(checked, U, times)
         X = solution.X.detach().to("cpu", torch.float64)
         certificate = _certificate(checked.problem, X, U, verdict.feasible, solution, times)
         rows = pd.DataFrame(
             {
-                **self.shared, "layout": layouts.ids, "status": statuses, **frame_columns(verdict),
-                **durations(times), **more_columns(checked.problem, verdict),
+                **self.shared, "layout": layouts.ids, "status": statuses, **columns,
                 **certificate_columns(certificate),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),

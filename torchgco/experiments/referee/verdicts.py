@@ -11,13 +11,12 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.referee.controls import Controls
-from torchgco.experiments.results.durations import durations, states_of, times_at
+from torchgco.experiments.results.durations import judged_columns, states_of, times_at
 from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import layout_digests
 from torchgco.experiments.results.success import with_success
 from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
-from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.scenarios import Layouts, Task, Vehicle
 
 AT_ONCE = 64  # layouts judged at once
@@ -69,7 +68,7 @@ def _rows(task: Task, solver: Controls, places: np.ndarray) -> pd.DataFrame:
     times = times_at(solver.times, places, problem.N)
     if times is not None:  # of a layout that is lacking the times are, too
         times = torch.where(times.isfinite().all(-1, keepdim=True), times, _usual(task))
-    verdict = judge(problem, U, task.goal, task.goal_radius, times=times)
+    verdict, columns = judged_columns(task, U, times)
     X = states_of(problem, U, times)
     certificate = certify(problem, X, U, verdict.feasible, times=times)
     lacking, stages = solver.lacking[places], problem.stages.numpy()
@@ -78,8 +77,8 @@ def _rows(task: Task, solver: Controls, places: np.ndarray) -> pd.DataFrame:
     status = np.where(lacking >= stages, ABSENT, np.where(lacking > 0, INCOMPLETE, status))
     return pd.DataFrame(
         {
-            "layout": task.layouts.ids, "solver": solver.name, "status": status, **frame_columns(verdict),
-            **durations(times), **more_columns(problem, verdict), **certificate_columns(certificate),
+            "layout": task.layouts.ids, "solver": solver.name, "status": status, **columns,
+            **certificate_columns(certificate),
             "seconds": solver.seconds[places], "settings_digest": solver.digest,
         }
     )  # fmt: skip

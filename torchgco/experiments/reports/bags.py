@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchgco.base.errors import InputError
+from torchgco.base.extras import imported
 from torchgco.obstacles.attitude import QUATERNION
 from torchgco.problem.sampled import RATE_OF_POSITION, SECOND_RATE, TIME_COLUMN
 
@@ -40,19 +41,15 @@ def write_bag(folder: Path, columns: Mapping[str, np.ndarray], position: Sequenc
     """
     if not position:
         raise InputError("--bag", "a vehicle with a position", "one without")
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise InputError("--bag", "rosbags (`pip install torchgco[ros]`)", error) from None
+    rosbag2, typesys = (imported(f"rosbags.{name}", "ros", "--bag") for name in ("rosbag2", "typesys"))
     if folder.exists():
         if not (folder / "metadata.yaml").is_file():
             raise InputError("--output", "a folder whose bags are rosbags", folder)
         shutil.rmtree(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     made = _Messages(store.types, columns, position)
-    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as bag:
+    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[storage.upper()]) as bag:
         for topic, messages in (
             ("/path", made.path()),
             ("/trajectory", made.trajectory()),

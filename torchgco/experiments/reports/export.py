@@ -24,7 +24,6 @@ from torchgco.experiments.reports.finished import Study
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import write
-from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.experiments.statistics.statistics import PAIR, swept_columns
 from torchgco.experiments.statistics.tables import csv_text
 from torchgco.export import export_c
@@ -109,11 +108,11 @@ def _of_one(
     study: Study, rate: float | None, wanted: Callable[[str, int], bool], columns_of: slice, ending: str
 ) -> Iterator[Table]:
     """The trajectories of one vehicle, whose controls are some of those that the study kept."""
-    all_times = study.times
-    for places, problem in study.batches():
-        for name, controls in study.flown(SOLUTIONS, "U").items():
-            U = torch.from_numpy(controls[places, : problem.N, columns_of].copy())
-            knot_times = durations.times_at(None if all_times is None else all_times[name], places, problem.N)
+    for places, task in study.tasks():
+        problem = task.problem
+        for name in study.controls:
+            every, knot_times = study.flight(name, places, problem.N)
+            U = every[..., columns_of].contiguous()
             X = durations.states_of(problem, U, knot_times)
             t = times(problem).expand(problem.B, -1) if knot_times is None else knot_times
             for b, number in enumerate(study.layouts.ids[places].tolist()):

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
+from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
+from torchgco.experiments.results.durations import times_at
 from torchgco.experiments.results.files import damaged, readable
 from torchgco.experiments.results.folder import (
     DONE,
@@ -28,7 +32,7 @@ from torchgco.experiments.results.identity import Manifest
 from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.missions import Mission
 from torchgco.problem.problem import Problem
-from torchgco.scenarios import Layouts, Vehicle
+from torchgco.scenarios import Layouts, Task, Vehicle
 from torchgco.view.document import Document
 from torchgco.view.vehicles import Look
 
@@ -51,8 +55,11 @@ class Study:
     trust: bool = False
 
     @classmethod
-    def read(cls, folder: Path, trust: bool = False) -> Study:
+    def read(cls, folder: Path, trust: bool = False, changed: bool = False) -> Study:
         """The study in a folder.
+
+        Args:
+            changed: whether its table may have been changed since.
 
         Raises:
             InputError: a folder without a finished study, with damaged files, or without `trust` one whose study.json
@@ -64,7 +71,9 @@ class Study:
             raise InputError("RUN", "a finished study (the same command resumes it)", folder)
         manifest = read_manifest(folder / MANIFEST, whole=True)
         vehicle = vehicle_of(manifest.configuration, trust)
-        layouts, trials = read_layouts(folder / LAYOUTS, trust), read_trials(folder / TRIALS, trust)
+        layouts = readable(folder / LAYOUTS, read_layouts, trust=trust)
+        path = folder / TRIALS
+        trials = readable(path, read_table, trust=trust) if changed else read_trials(path, trust)
         if not trust:
             check_stages(folder, vehicle, layouts, MEASURED_AT_ONCE)
         return cls(folder, manifest, vehicle, layouts, trials, trust)
@@ -109,15 +118,25 @@ class Study:
         """The rows of the table by solver and layout."""
         return {(row["solver"], row["layout"]): row for row in self.trials.to_dict("records")}  # type: ignore[misc]
 
-    def batches(self) -> Iterator[tuple[np.ndarray, Problem]]:
-        """Problems of some layouts at a time, and their places."""
+    def tasks(self) -> Iterator[tuple[np.ndarray, Task]]:
+        """The places of some layouts at a time, and what is flown there."""
         for places in self.layouts.together(MEASURED_AT_ONCE):
-            yield places, self.vehicle.task(self.layouts.take(places)).problem
+            yield places, self.vehicle.task(self.layouts.take(places))
 
-    @property
+    @cached_property
+    def controls(self) -> dict[str, np.ndarray]:
+        """The controls (L, N, m) of each solver; errors as `flown`."""
+        return self.flown(SOLUTIONS, "U")
+
+    @cached_property
     def times(self) -> dict[str, np.ndarray] | None:
         """The times (L, N+1) of the knots by solver, s, where the time is free; else None."""
         return None if self.layouts.free_time is None else self.flown(SOLUTIONS, "times")
+
+    def flight(self, name: str, places: np.ndarray, N: int) -> tuple[Tensor, Tensor | None]:
+        """A solver's controls (B, N, m) of some layouts, and the times (B, N+1) of the knots, s, where free."""
+        t = times_at(None if self.times is None else self.times[name], places, N)
+        return torch.from_numpy(self.controls[name][places, :N]), t
 
     def mission(self, solver: str) -> Mission:
         """The closed loop of a study of missions, as a solver's name flew it."""

@@ -40,7 +40,8 @@ def missions(study: Study, searched: Mapping[int, SearchPart]) -> Document:
         searched: searches of first plans by the numbers of their missions.
     """
     log, document = _Log.read(study), None
-    for places, problem in study.batches():
+    for places, task in study.tasks():
+        problem = task.problem
         document = document or document_of(study, problem, QUADROTOR)
         for b, number in enumerate(study.layouts.ids[places].tolist()):
             single = problem.take(torch.tensor([b]))

@@ -11,7 +11,6 @@ import io
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,38 +18,32 @@ import pandas as pd
 import torch
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.config.build import vehicle_of
 from torchgco.experiments.flying.fleet_flight import fleet_columns
 from torchgco.experiments.flying.mission_flight import FAILED
-from torchgco.experiments.results.durations import durations, times_at
+from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study
+from torchgco.experiments.results.durations import judged_columns
 from torchgco.experiments.results.files import damaged, readable
 from torchgco.experiments.results.folder import (
     DONE,
-    LAYOUTS,
+    JUDGED,
     MANIFEST,
-    MISSION,
-    SOLUTIONS,
     TRIALS,
     StudyFolder,
-    read_manifest,
 )
-from torchgco.experiments.results.identity import Manifest, closed_loop, layout_digests
+from torchgco.experiments.results.identity import closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
-from torchgco.experiments.results.limits import check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.experiments.results.runs import below
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.results.variants import values_of
 from torchgco.experiments.statistics.statistics import swept_columns
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.fleets.drawn import solution_of
-from torchgco.judging.judge import frame_columns, judge, more_columns
 from torchgco.missions.contact import Contact
 from torchgco.missions.outcome import Outcome
 from torchgco.missions.tables import STATES, step_columns
-from torchgco.scenarios import Layouts, Vehicle
+from torchgco.scenarios import Layouts
 
 TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently
-BATCH = 256  # layouts judged at once
 TRIAL = ["solver", "layout"]
 IDENTITY = ("model", "seed", "version", "device", "dtype", "layout_digest", "settings_digest")
 ROW_KEYS = pd.Index(["solver", "solver_a", "solver_b", "outcome"])  # of a row of summary.csv or paired.csv
@@ -123,26 +116,20 @@ def verify(folders: Iterable[str | os.PathLike[str]], trust: bool = False) -> tu
 
 def verify_study(folder: Path, trust: bool = False) -> Verification:
     """Confirm the table of one finished study. Raises InputError as `verify` does."""
-    manifest = read_manifest(folder / MANIFEST, whole=True)
-    missions = manifest.configuration.get("mission") is not None
-    layouts = readable(folder / LAYOUTS, read_layouts, trust=trust)
-    kept = readable(folder / TRIALS, read_table, trust=trust)
+    study = Study.read(folder, trust, changed=True)
+    manifest, kept = study.manifest, study.trials
     rows = pd.MultiIndex.from_product([list(manifest.solvers), list(manifest.layouts)], names=TRIAL)
     if not set(TRIAL) <= set(kept.columns) or not kept.set_index(TRIAL).index.sort_values().equals(rows.sort_values()):
         raise damaged(folder / TRIALS, "doesn't have one row per solver and layout")
     kept = kept.set_index(TRIAL)
-    vehicle = vehicle_of(manifest.configuration, trust)
-    if not trust:
-        check_stages(folder, vehicle, layouts, BATCH)
+    single = _trajectories if study.layouts.vehicles is None else _fleets
     try:
-        single = _trajectories if layouts.vehicles is None else _fleets
-        judged = partial(_missions if missions else single, trust)
-        computed = judged(folder, vehicle, manifest, layouts, kept).reindex(kept.index)
+        computed = (_missions if study.missions else single)(study).reindex(kept.index)
     except (InputError, KeyError, IndexError, TypeError, AttributeError, ValueError, RuntimeError) as error:
         if isinstance(error, InputError) and error.field in ("hydra.run.dir", "RUN"):
             raise
         raise damaged(folder, f"can't be simulated again ({error})") from None
-    computed = computed.join(_identity(manifest, vehicle, layouts, kept.index))
+    computed = computed.join(_identity(study, kept.index))
     keys = values_of(kept.reset_index(), manifest, swept_columns(kept))
     computed = computed.assign(**keys)
     differences = _differences(kept, computed)
@@ -152,7 +139,7 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     trials = Table(TRIALS, len(kept), tuple(computed.columns), others, differences)
     # Of rows that differ, the tables that count them would differ, too.
     counted, absent = _counted(folder, kept.reset_index()) if differences.empty else ([], ())
-    return Verification(folder, (trials, *counted), absent, missions)
+    return Verification(folder, (trials, *counted), absent, study.missions)
 
 
 def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str, ...]]:
@@ -174,68 +161,58 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
     return tables, tuple(absent)
 
 
-def _identity(manifest: Manifest, vehicle: Vehicle, layouts: Layouts, index: pd.MultiIndex) -> pd.DataFrame:
+def _identity(study: Study, index: pd.MultiIndex) -> pd.DataFrame:
     """The columns that name layouts, settings and surroundings, from layouts.npz and study.json."""
-    configuration = manifest.configuration
-    codes = layout_digests(layouts, configuration["model"]["vehicle"], closed_loop(configuration))
-    rows = pd.DataFrame({"model": vehicle.name, **manifest.constants}, index=index)
+    manifest, configuration = study.manifest, study.manifest.configuration
+    codes = layout_digests(study.layouts, configuration["model"]["vehicle"], closed_loop(configuration))
+    rows = pd.DataFrame({"model": study.vehicle.name, **manifest.constants}, index=index)
     rows["layout_digest"] = index.get_level_values("layout").map(codes)
     rows["settings_digest"] = index.get_level_values("solver").map(manifest.settings)
     return rows[list(IDENTITY)]
 
 
-def _trajectories(
-    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, stored_rows: pd.DataFrame
-) -> pd.DataFrame:
+def _trajectories(study: Study) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
-    arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
-    names, index = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
-    parts, tasks = [], [vehicle.task(layouts.take(places)) for places in layouts.together(BATCH)]
-    for name in manifest.solvers:
-        controls = torch.from_numpy(arrays["U"][names.index(name)])
-        held_times = arrays["times"][names.index(name)] if "times" in arrays else None
-        for task in tasks:
-            ids = task.layouts.ids
-            stored = [index[number] for number in ids.tolist()]
-            times = times_at(held_times, stored, task.problem.N)
-            verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
-            columns = {"solver": name, "layout": ids, **frame_columns(verdict)}
-            more = durations(times) | more_columns(task.problem, verdict)
-            parts.append(pd.DataFrame(columns | more))
-    rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
-    return rows.set_index(TRIAL)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
+    parts = []
+    for places, task in study.tasks():
+        for name in study.manifest.solvers:
+            _, columns = judged_columns(task, *study.flight(name, places, task.problem.N))
+            parts.append(pd.DataFrame({"solver": name, "layout": task.layouts.ids, **columns}))
+    return _with_success(study, parts)
 
 
-def _fleets(
-    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, stored_rows: pd.DataFrame
-) -> pd.DataFrame:
+def _fleets(study: Study) -> pd.DataFrame:
     """The judged columns of fleets, by (solver, layout)."""
-    arrays, parts = readable(folder / SOLUTIONS, read_npz, trust=trust), []
-    for name, U in zip(arrays["solver"].tolist(), arrays["U"], strict=True):
-        for places in layouts.together(BATCH):
-            some = layouts.take(places)
-            columns = fleet_columns(solution_of(vehicle, some, U[places]).verdict)
+    parts = []
+    for name, U in study.controls.items():
+        for places in study.layouts.together(MEASURED_AT_ONCE):
+            some = study.layouts.take(places)
+            columns = fleet_columns(solution_of(study.vehicle, some, U[places]).verdict)
             parts.append(pd.DataFrame({"solver": name, "layout": some.ids, **columns}))
-    rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
-    return rows.set_index(TRIAL)[[*columns, "success", "best_cost", "best_from"]]
+    return _with_success(study, parts)
 
 
-def _missions(
-    trust: bool, folder: Path, vehicle: Vehicle, manifest: Manifest, layouts: Layouts, stored_rows: pd.DataFrame
-) -> pd.DataFrame:
+def _with_success(study: Study, parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Judged columns as one table by (solver, layout), with those that compare its rows."""
+    rows = pd.concat(parts, ignore_index=True)
+    judged = [name for name in rows.columns if name not in TRIAL]
+    return with_success(rows, study.layouts, len(study.manifest.solvers)).set_index(TRIAL)[[*judged, *JUDGED]]
+
+
+def _missions(study: Study) -> pd.DataFrame:
     """The columns of missions that the log decides, by (solver, layout).
 
     The log has the plant's state at the start of every control step, and a flight is judged at all time steps: the
     outcome itself, and what belongs to the end of a flight, can't be confirmed.
     """
-    log = readable(folder / MISSION, read_log, trust=trust)
+    log, layouts, solvers = study.log, study.layouts, study.manifest.solvers
     log["shifted"] = log["source"] == "shifted"
-    problem = vehicle.task(layouts).problem
+    problem = study.vehicle.task(layouts).problem
     contact, period = Contact.among(problem), float(problem.dynamics.dt)
     flights = {key: rows for key, rows in log.groupby(["solver", "mission"], sort=False)}
-    nearest = {name: _nearest(log[log["solver"] == name], layouts, contact, period) for name in manifest.solvers}
+    nearest = {name: _nearest(log[log["solver"] == name], layouts, contact, period) for name in solvers}
     rows = []
-    for (solver, layout), outcome in stored_rows["outcome"].items():
+    for (solver, layout), outcome in study.trials.set_index(TRIAL)["outcome"].items():
         steps = flights.get((solver, layout), log.iloc[:0])
         rows.append(
             {

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import say
@@ -17,7 +16,7 @@ from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study, docum
 from torchgco.experiments.reports.mission_view import missions
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.searched import searches
-from torchgco.experiments.results.durations import states_of, times_at
+from torchgco.experiments.results.durations import states_of
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS
 from torchgco.fleets.drawn import solution_of
@@ -55,16 +54,15 @@ def study_page(folder: Path, searched: Sequence[int] = (), trust: bool = False) 
 
 def _trajectories(study: Study, searched: Mapping[int, SearchPart]) -> Document:
     """Single trajectories, rolled out from the controls that the study kept."""
-    controls, held_times = study.flown(SOLUTIONS, "U"), study.times
     document, rows, order = None, study.rows, list[np.ndarray]()
     bar = page_bar(study.layouts.count, SLOW_PAGE, "layout")
-    for places, problem in study.batches():
+    for places, task in study.tasks():
+        problem = task.problem
         look = look_of(problem.dynamics)
         document = document or document_of(study, problem, look)
         ids, flown = study.layouts.ids[places].tolist(), []
         for name in document.solvers:
-            U = torch.from_numpy(controls[name][places, : problem.N])
-            t = times_at(None if held_times is None else held_times[name], places, problem.N)
+            U, t = study.flight(name, places, problem.N)
             X = states_of(problem, U, t)
             here = [rows[name, number] for number in ids]
             touching = np.array([not row["clearance"] >= 0 for row in here])
@@ -73,7 +71,8 @@ def _trajectories(study: Study, searched: Mapping[int, SearchPart]) -> Document:
         for b, number in enumerate(ids):
             shown = [flights[b] for flights in flown if len(flights[b].path)]
             # The knots' times are those of the solver under study; others are shown at the same knots.
-            knot_times = None if held_times is None else held_times[document.solvers[0]][places[b], : problem.N + 1]
+            all_times = study.times
+            knot_times = None if all_times is None else all_times[document.solvers[0]][places[b], : problem.N + 1]
             document.add(f"layout {number}", problem, b, shown, searched.get(number), knot_times)
         bar.update(len(ids))
         order.append(places)

@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from torchgco.dynamics.rollout import open_loop
+from torchgco.judging.judge import Verdict, frame_columns, judge, more_columns
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
+from torchgco.scenarios import Task
 
 
 def with_lengths(U: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -26,9 +28,11 @@ def parted(flown: np.ndarray) -> dict[str, np.ndarray]:
     return {"U": flown[..., :-1], "times": times}
 
 
-def durations(times: Tensor | None) -> dict[str, Any]:
-    """The column `duration`, s, of times (B, N+1); none where the time is given."""
-    return {} if times is None else {"duration": times[:, -1].cpu().numpy()}
+def judged_columns(task: Task, U: Tensor, times: Tensor | None) -> tuple[Verdict, dict[str, Any]]:
+    """The verdict on controls (B, N, m), with times (B, N+1) of the knots where these are free, and its columns."""
+    verdict = judge(task.problem, U, task.goal, task.goal_radius, times=times)
+    free = {} if times is None else {"duration": times[:, -1].cpu().numpy()}  # s
+    return verdict, frame_columns(verdict) | free | more_columns(task.problem, verdict)
 
 
 def states_of(problem: Problem, U: Tensor, times: Tensor | None) -> Tensor:

@@ -72,10 +72,8 @@ def read_table(path: Path, trust: bool = False, **options: Any) -> pd.DataFrame:
         return _table(path, options)
     try:
         with _counted(), limited(LARGEST_FILE):
-            if (size := _size(path)) > LARGEST_FILE:
-                refuse(path, f"a table of {size / 1e9:.3g} GB")
             return _table(path, options)
-    except MemoryError:  # a page that is longer than its headers say, or a text in many rows
+    except MemoryError:  # many cells, a page that is longer than its headers say, or a text in many rows
         refuse(path, "a table that takes more")
 
 
@@ -136,30 +134,3 @@ def _table(path: Path, options: Mapping[str, Any]) -> pd.DataFrame:
             raise ValueError(f"column {field.name} of {field.type}")
     # Most tables are small: threads cost more than they save.
     return pd.read_parquet(path, use_threads=False, **options)
-
-
-def _size(path: Path) -> int:
-    """Bytes of a parquet file's table as its headers say; of texts that repeat also from their dictionaries."""
-    with pyarrow.parquet.ParquetFile(path) as file:
-        about = file.metadata
-        groups = [about.row_group(i) for i in range(about.num_row_groups)]
-        size = max(about.num_rows * about.num_columns * NUMBER_BYTES, sum(group.total_byte_size for group in groups))
-        if size > LARGEST_FILE:
-            return size
-        texts = [i for i in range(about.num_columns) if about.schema.column(i).physical_type == "BYTE_ARRAY"]
-        for i in texts:
-            # At worst one text is the whole column, and every row repeats it.
-            chunks = [group.column(i) for group in groups]
-            if sum(chunk.total_uncompressed_size * chunk.num_values for chunk in chunks) > LARGEST_FILE:
-                size += _longest(path, about.schema.column(i).path) * about.num_rows
-    return size
-
-
-def _longest(path: Path, column: str) -> int:
-    """Bytes of the longest text in a column; repeated ones are held once."""
-    table = pyarrow.parquet.read_table(path, columns=[column], read_dictionary=[column], use_threads=False)
-    longest = 0
-    for chunk in table.column(0).chunks:
-        texts = chunk.dictionary if isinstance(chunk, pyarrow.DictionaryArray) else chunk
-        longest = max(longest, pyarrow.compute.max(pyarrow.compute.binary_length(texts)).as_py() or 0)
-    return longest

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +15,6 @@ NPZ = "a map with occupied (X, Y[, Z]), origin (d,) and resolution"
 MAP_LIMIT = "that a map's file may take"
 TASK_KEYS = ("start", "goal", "vehicle_radius", "goal_radius")
 NPY = "an npy file of numbers, without pickles"
-HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 def read_npz(source: Source) -> OccupancyGrid:
@@ -60,24 +57,10 @@ def read_npy(
 
 
 def _array(source: Source) -> np.ndarray:
-    """The array; its size is compared with the file's before memory is taken."""
-    size = source.size(NPY)
-    source.limit(size, MOST_BYTES, "bytes")
-    with source.library(NPY), open(source.path, "rb") as file:
-        version = np.lib.format.read_magic(file)
-        if version not in HEADERS:
-            source.refuse(f"{NPY}, version 1.0 or 2.0", version)
-        shape, fortran, dtype = HEADERS[version](file)
-        count, head = _count(source, shape), file.tell()
-        if dtype.hasobject or dtype.kind not in "biuf":
-            source.refuse(NPY, dtype)
-        if count * dtype.itemsize != size - head:
-            source.refuse(f"{count * dtype.itemsize:,} bytes of numbers from byte {head:,}", f"{size - head:,} bytes")
-        flat = np.fromfile(file, dtype, count)
-    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
-
-
-def _count(source: Source, shape: Any) -> int:
-    if not all(isinstance(side, int) and not isinstance(side, bool) and side >= 0 for side in shape):
-        source.refuse("sides of the array, whole numbers", shape)
-    return math.prod(shape)
+    """The array; NumPy compares its size with the file's before memory is taken."""
+    source.limit(source.size(NPY), MOST_BYTES, "bytes")
+    with source.library(NPY):
+        array = np.load(source.path, mmap_mode="r", allow_pickle=False)
+        if array.dtype.kind not in "biuf":
+            source.refuse(NPY, array.dtype)
+        return np.array(array)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchgco.base.extras import imported
 from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, Source, finite_points
 
 LAS_FILE = "a las or laz file of points"
@@ -17,10 +18,7 @@ def read_las(source: Source) -> np.ndarray:
         InputError: another file, a damaged one, or one of too many points.
     """
     source.limit(source.size(LAS_FILE), MOST_BYTES, "bytes")
-    try:
-        import laspy
-    except ImportError:
-        source.refuse("las with the extra maps: pip install 'torchgco[maps]'", "no laspy")
+    laspy = imported("laspy", "maps", source.field)
     with source.library(LAS_FILE), laspy.open(source.path) as file:
         source.limit(file.header.point_count, MOST_POINTS, "points")
         parts = [np.stack([chunk.x, chunk.y, chunk.z], axis=-1) for chunk in file.chunk_iterator(RECORDS_AT_ONCE)]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 from io import BytesIO
-from typing import Any
 
 import numpy as np
 
+from torchgco.base.extras import imported
 from torchgco.maps.files.source import MOST_CELLS, MOST_TEXT, Source, check_far, made
 from torchgco.maps.grid import OccupancyGrid
 
@@ -44,19 +44,10 @@ def read_mesh(source: Source, resolution: float | None, solid: bool | None) -> O
     return made(source, cells, low * resolution, resolution)
 
 
-def library_of_meshes(source: Source) -> Any:
-    """trimesh; InputError where it isn't installed."""
-    try:
-        import trimesh
-    except ImportError:
-        source.refuse(f"{source.path.suffix} with the extra maps: pip install 'torchgco[maps]'", "no trimesh")
-    return trimesh
-
-
 def _loaded(source: Source) -> tuple[np.ndarray, np.ndarray, bool]:
     """Vertices (V, 3), m, faces (F, 3), and whether the surface is closed."""
     raw, kind = source.bytes(MESH_FILE, MOST_TEXT), source.path.suffix.lower()[1:]
-    trimesh = library_of_meshes(source)
+    trimesh = imported("trimesh", "maps", source.field)
     with source.library(MESH_FILE):  # no resolver: files that it names, such as materials, aren't read
         mesh = trimesh.load_mesh(BytesIO(raw), file_type=kind, force="mesh", skip_materials=True)
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # textures and normals cut surfaces along their seams

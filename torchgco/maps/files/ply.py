@@ -9,8 +9,9 @@ from io import BytesIO
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.extras import imported
 from torchgco.base.memory import limited
-from torchgco.maps.files.meshes import library_of_meshes, read_mesh
+from torchgco.maps.files.meshes import read_mesh
 from torchgco.maps.files.source import MOST_BYTES, MOST_POINTS, MOST_TEXT, Source, finite_points
 from torchgco.maps.grid import OccupancyGrid
 
@@ -48,7 +49,7 @@ def read_ply(source: Source, resolution: float | None, solid: bool | None) -> np
         source.refuse(f"{PLY} without lists", "lists among or before the vertices")
     if b"ascii" in header:
         source.limit(len(raw), MOST_TEXT, "bytes of text")
-    trimesh = library_of_meshes(source)
+    trimesh = imported("trimesh", "maps", source.field)
     with source.library(PLY), limited(PLY_MEMORY), warnings.catch_warnings():
         warnings.simplefilter("error")  # NumPy's, of text that holds no numbers
         loaded = trimesh.exchange.ply.load_ply(BytesIO(raw), skip_materials=True)

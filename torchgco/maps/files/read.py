@@ -45,7 +45,7 @@ class Format:
 
 def _read_bag(source: Source, topic: str | None) -> OccupancyGrid | np.ndarray:
     """Imported late: some builds of Python lack what packed bags and SQLite need."""
-    from torchgco.maps.files.bags.bag import read_bag
+    from torchgco.maps.files.bags import read_bag
 
     return read_bag(source, topic)
 

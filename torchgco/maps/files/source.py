@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -76,17 +76,6 @@ class Source:
         except OSError as error:
             self.refuse(expected, _reason(error))
 
-    @contextmanager
-    def opened(self, expected: str) -> Iterator[tuple[FileBytes, int]]:
-        """The bytes of the open file, which may be larger than memory, and their number."""
-        size = self.size(expected)
-        try:
-            file = open(self.path, "rb")  # noqa: SIM115
-        except OSError as error:
-            self.refuse(expected, _reason(error))
-        with file:
-            yield FileBytes(file, size), size
-
     def limit(self, count: int, most: int, what: str) -> None:
         """InputError where `count` of `what` is more than `most`: called before memory is taken."""
         if count > most:
@@ -110,34 +99,16 @@ def _reason(error: Exception) -> str:
     return (said.splitlines() or [type(error).__name__])[0]
 
 
-class FileBytes:
-    """The bytes of an open file, read piece by piece: for files that may be larger than memory."""
-
-    def __init__(self, file: IO[bytes], size: int) -> None:
-        self.file, self.size = file, size
-
-    def __len__(self) -> int:
-        return self.size
-
-    def __getitem__(self, span: slice) -> memoryview:
-        self.file.seek(span.start)
-        return memoryview(self.file.read(span.stop - span.start))
-
-
 class Cursor:
     """Reads a file's bytes in order; an end that comes too early is an InputError that names the byte.
 
     Args:
         expected: what the file should be, for errors.
         at: the first byte.
-        before: bytes of the file before `data`, for errors.
     """
 
-    def __init__(
-        self, source: Source, data: bytes | memoryview | FileBytes, expected: str, at: int = 0, before: int = 0
-    ) -> None:
-        self.source, self.expected, self.at, self.before = source, expected, at, before
-        self.data = data if isinstance(data, FileBytes) else memoryview(data)
+    def __init__(self, source: Source, data: bytes, expected: str, at: int) -> None:
+        self.source, self.expected, self.at, self.data = source, expected, at, memoryview(data)
 
     @property
     def left(self) -> int:
@@ -147,16 +118,10 @@ class Cursor:
     def take(self, count: int, what: str) -> memoryview:
         """The next `count` bytes."""
         if count < 0 or count > self.left:
-            self._cut(count, what, self.left)
+            expected = f"{self.expected} with {count:,} bytes of {what} at byte {self.at:,}"
+            self.source.refuse(expected, f"{self.left:,} bytes there")
         self.at += count
-        taken = self.data[self.at - count : self.at]
-        if len(taken) < count:  # another program has cut the file meanwhile
-            self._cut(count, what, len(taken))
-        return taken
-
-    def _cut(self, count: int, what: str, left: int) -> NoReturn:
-        where = f"at byte {self.before + self.at:,}"
-        self.source.refuse(f"{self.expected} with {count:,} bytes of {what} {where}", f"{left:,} bytes there")
+        return self.data[self.at - count : self.at]
 
     def number(self, kind: str, what: str) -> Any:
         """The next number, by a letter of `struct`, little-endian."""

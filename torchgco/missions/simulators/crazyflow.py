@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.extras import imported
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.drone_models import WXYZ, XYZW, parameters_of
-from torchgco.missions.simulators.each import EachPlant, imported
+from torchgco.missions.simulators.each import EachPlant
 
 FREQUENCY = 500  # Hz, the package's own, at least
 FROM_FRONT_LEFT = [3, 0, 1, 2]  # the package counts rotors clockwise, too, from the front right one
@@ -66,7 +67,7 @@ def _written(frame: Airframe, *deviation: float) -> tuple[dict[str, Any], tuple[
 @cache
 def _named(name: str) -> tuple[dict[str, Any], tuple[float, float]]:
     """The parameters of one of the package's own vehicles, rotors in our order, and its limits in rpm."""
-    models = imported("drone_models.core", "drone-models", "crazyflow")
+    models = imported("drone_models.core", "crazyflow", "plant", "drone-models")
     try:
         known = models.load_params("first_principles", name)
     except KeyError:
@@ -110,4 +111,4 @@ def _package() -> Any:
     """The package's module of its simulation."""
     if os.environ.get(ARRAY_API) != "1":
         raise InputError("plant", f"{ARRAY_API}=1 in the environment that Python starts in, for crazyflow", "none")
-    return imported("crazyflow.sim.sim", "crazyflow", "crazyflow")
+    return imported("crazyflow.sim.sim", "crazyflow", "plant")

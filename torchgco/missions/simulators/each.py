@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any
 
 import numpy as np
 import torch
@@ -51,15 +49,3 @@ class EachPlant(RotorPlant):
             if np.any(np.asarray(getattr(self, name)) != 0):
                 raise InputError(f"plant.{name}", f"0 for a vehicle of plant.{field}", getattr(self, name))
         return True
-
-
-def imported(module: str, title: str, extra: str) -> Any:
-    """A simulator's module.
-
-    Raises:
-        InputError: it isn't installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise InputError("plant", f"{title} (`pip install torchgco[{extra}]`)", error) from None

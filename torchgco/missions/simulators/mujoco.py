@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.extras import imported
 from torchgco.dynamics.quadrotor import Airframe
-from torchgco.missions.simulators.each import EachPlant, imported
+from torchgco.missions.simulators.each import EachPlant
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, files_named, mjcf
 from torchgco.obstacles.attitude import rotation
 
@@ -206,4 +207,4 @@ def _product(a: Any, b: Any) -> np.ndarray:
 
 def _mujoco() -> Any:
     """The package."""
-    return imported("mujoco", "MuJoCo", "mujoco")
+    return imported("mujoco", "mujoco", "plant", "MuJoCo")

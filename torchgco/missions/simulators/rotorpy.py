@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from torchgco.base.errors import InputError
+from torchgco.base.extras import imported
 from torchgco.dynamics.quadrotor import RADIANS, Airframe
 from torchgco.missions.drone_models import WXYZ, XYZW
-from torchgco.missions.simulators.each import EachPlant, imported
+from torchgco.missions.simulators.each import EachPlant
 from torchgco.missions.simulators.mjcf import ROTOR_CORNERS
 
 ODE_SOLVER = {"method": "RK45", "rtol": 1e-6, "atol": 1e-9}  # the package's own tolerance is 1e-3 of a step
@@ -106,4 +107,4 @@ def _named(name: str) -> tuple[Any, np.ndarray]:
 
 def _multirotor() -> Any:
     """The package's class."""
-    return imported("rotorpy.vehicles.multirotor", "RotorPy", "rotorpy").Multirotor
+    return imported("rotorpy.vehicles.multirotor", "rotorpy", "plant", "RotorPy").Multirotor

@@ -1,9 +1,8 @@
-/* The search for short paths between obstacles, one problem after the other: search.py in C.
+/* The search for short paths between obstacles, one problem after the other; roadmap/cheapest.py calls it.
 
-   Both do the same operations in the same order, and none is fused here (-ffp-contract=off): all numbers but square
-   roots, which PyTorch doesn't always round correctly, agree to the last bit. Clearance and nearness are therefore
-   compared as squares, detours and costs with a tolerance, and ties are broken by the lowest index: the paths are the
-   same. DIM is the number of coordinates, BLOCK of edges measured side by side. */
+   Operations have one order, and none is fused here (-ffp-contract=off). Clearance and nearness are compared as squares,
+   detours and costs with a tolerance, and ties are broken by the lowest index: a plain search (tests/reference) finds the
+   same paths. DIM is the number of coordinates, BLOCK of edges measured side by side. */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>

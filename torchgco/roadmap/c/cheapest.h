@@ -1,5 +1,5 @@
 /* What the search reads and writes: B problems among M spheres, graphs of V points with K edges each, and paths of P
-   corners. Python's own declaration follows from this one (roadmap/native.py), which also gives the numbers of
+   corners. Python's own declaration follows from this one (roadmap/cheapest.py), which also gives the numbers of
    compile_flags.txt. */
 #pragma once
 #include <stdint.h>
