@@ -19,7 +19,7 @@ from torchgco.compiled.answer import Answer
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled, compile
 from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbers import Numbers
-from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of
+from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, stage_of
 from torchgco.kernels import held_on_cpu
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, held
@@ -39,7 +39,9 @@ class MPC:
     can be flown then, and after it the solver does. Where all fail or are late, a vehicle flies the plan before with
     feedback on the measured state, if the constraints of now allow that, else what comes to rest, else what breaks them
     least. All controls are within their bounds. `RateBounds` with a `previous` count from the controls that were
-    returned last. Obstacles that move go on by themselves where a step doesn't say where they are.
+    returned last; where a period is shorter than a stage they have a row per knot, and the first one allows as much of
+    a stage's change as the period is of the stage. Obstacles that move go on by themselves where a step doesn't say
+    where they are.
 
     Where the time is free, a plan lasts as long as is left of the one before, or as is best. Controls are the plan's
     means over the next period, and of stages that are longer those of the first.
@@ -92,6 +94,8 @@ class MPC:
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
         self._previous = [f"constraints[{i}].previous" for i, c in enumerate(problem.constraints) if follows(c)]
+        if self._previous and self.period < self.dt:
+            asked, problem = (in_periods(one, self.period / self.dt) for one in (asked, problem))
         self._motion = Motion(problem)
         places = self._motion.places
         changes = None if changes is None else ["x0", *self._previous, *places, *changes]
