@@ -47,3 +47,15 @@ def test_a_trajectory_through_an_obstacle_is_no_best_one() -> None:
         table = torchgco.compare(problem, ["al_ilqr", "hold"])
     assert table["cost"].iloc[0] < table["cost"].iloc[1] and (table["clearance"] < 0).tolist() == [True, False]
     assert np.isnan(table["cost_ratio"].iloc[0]) and table["cost_ratio"].iloc[1] == 1.0
+
+
+def test_a_trajectory_is_judged_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For its columns, and for the best cost, it was twice."""
+    problem, U0 = planar_batch(B=2, N=10, obstacles=2)
+    judged = []
+    for place in (torchgco.api, torchgco.judging.judge):
+        monkeypatch.setattr(
+            place, "judge", lambda *given, own=place.judge, **named: (judged.append(1), own(*given, **named))[1]
+        )
+    table = torchgco.compare(problem, ["hold", "al_ilqr"], U0)
+    assert len(judged) == 2 and "clearance" in table

@@ -22,7 +22,7 @@ from torchgco.constraints.norms import within_norms
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.solve import solve_fleet
 from torchgco.guesses import Guess, guesses_of, solve_guesses
-from torchgco.judging.judge import judge
+from torchgco.judging.judge import judge, judged_columns
 from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.phases import Phases, PhasesSolution
@@ -260,8 +260,9 @@ def compare(
         if problem.x0.device.type == "cuda":
             torch.cuda.synchronize(problem.x0.device)
         seconds = (clock.seconds() - began) / max(1, problem.B)
-        frames.append(_judged_frame(problem, found).assign(solver=name, seconds=seconds).reset_index())
-        feasible.append(_feasible(problem, found).cpu())
+        frame, sound = _judged_frame(problem, found)
+        frames.append(frame.assign(solver=name, seconds=seconds).reset_index())
+        feasible.append(sound.cpu())
     table = pd.concat(frames, ignore_index=True)
     good = table["reached"] if "reached" in table else pd.Series(torch.cat(feasible).numpy())
     cost = table["cost"].where(good.astype(bool))
@@ -285,20 +286,14 @@ def _named_solvers(problem: Problem, solvers: Any) -> dict[str, Solver]:
     return made
 
 
-def _judged_frame(problem: Problem, solution: Solution) -> pd.DataFrame:
+def _judged_frame(problem: Problem, solution: Solution) -> tuple[pd.DataFrame, Tensor]:
+    """The table of a solution, and which trajectories are feasible between the knots, too, and through every gate."""
+    frame, start = solution.to_frame(), None if problem.free_start is None else solution.X[:, 0]
     try:
-        return solution.to_frame(problem)
+        verdict = judge(problem, solution.U, start=start, times=solution.times)
     except InputError:  # obstacles of a kind that can't be judged
-        return solution.to_frame()
-
-
-def _feasible(problem: Problem, solution: Solution) -> Tensor:
-    """Which trajectories are feasible between the knots, too, and through every gate, (B,) bool."""
-    start = None if problem.free_start is None else solution.X[:, 0]
-    try:
-        return judge(problem, solution.U, start=start, times=solution.times).feasible
-    except InputError:  # as above
-        return torch.isin(solution.status, torch.tensor(CLAIMS, device=solution.status.device))
+        return frame, torch.isin(solution.status, torch.tensor(CLAIMS, device=solution.status.device))
+    return frame.assign(**judged_columns(problem, verdict)), verdict.feasible
 
 
 def _solver(solver: Solver | str, problem: Problem, record: bool) -> Solver:

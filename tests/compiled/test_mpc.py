@@ -176,6 +176,24 @@ def test_rates_count_from_the_controls_that_were_returned() -> None:
     assert np.abs(last).max() > 0.4
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("period", [0.02, 0.07])
+def test_rates_are_those_of_time_where_a_period_is_shorter_than_a_stage(period: float, seed: int) -> None:
+    """In every period, however short, they could change by as much as in a stage."""
+    random = np.random.default_rng(seed)
+    most, other = random.uniform(0.2, 0.6, (2, 2))
+    bounds = RateBounds(-most, other, previous=[0.0, 0.0], knots=[0, 1, 2, 4, 3, *range(5, N)])
+    mpc, x, last, steepest = MPC(driven(1, bounds), period=period, max_seconds=float("inf")), START, np.zeros(2), 0.0
+    for k in range(8):
+        u = mpc.step(x, x_ref=path(period * k) + np.array([2.0, 1.0, 0, 0]) * (-1) ** seed).numpy()
+        rate = (u - last) / period
+        assert mpc.statuses == [Status.CONVERGED]
+        assert (rate <= other / DT + 1e-5).all() and (rate >= -most / DT - 1e-5).all()
+        steepest = max(steepest, float((rate / np.where(rate > 0, other, most) * DT).__abs__().max()))
+        x, last = rk4(x, u, period), u
+    assert steepest > 0.99
+
+
 @pytest.mark.parametrize("context", [torch.inference_mode, lambda: torch.device("meta")], ids=["inference", "device"])
 def test_modes_and_default_devices_of_the_caller_change_nothing(context: Callable[[], Any]) -> None:
     mpc, other = MPC(driven()), MPC(driven())

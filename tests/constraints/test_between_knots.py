@@ -166,6 +166,7 @@ def test_numbers_are_those_of_the_stages_knot(kind: str) -> None:
         (BetweenKnots(FunctionConstraint(lambda x: x[..., :1], sense="equality")), "constraint"),
         (BetweenKnots(3), "constraint"),
         (BetweenKnots(BetweenKnots(RING[0])), "anyway"),
+        (BetweenKnots(FunctionConstraint(lambda x: x[..., :1], knots=[0])), "at which a stage ends, got knot 0 alone"),
     ],
 )
 def test_wrong_use_is_told(within: BetweenKnots, word: str) -> None:

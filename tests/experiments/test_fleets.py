@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,7 +13,7 @@ from tests.experiments.commands import problem_line
 from tests.view.test_packing import part
 from torchgco import Layouts, compose, read, solve
 from torchgco.experiments.reports.export import write_export
-from torchgco.experiments.reports.verify import verify_study
+from torchgco.experiments.reports.verify import confirmed_text, verify_study
 from torchgco.experiments.reports.view import main as view
 from torchgco.experiments.statistics.statistics import summarise
 
@@ -34,7 +36,9 @@ def test_a_study_of_fleets(run, run_until, tmp_path) -> None:
     found = solve(setup.fleet(setup.layouts(3)))
     with np.load(folder / "solutions.npz") as held:
         np.testing.assert_array_equal(held["U"][0], torch.cat([one.U for one in found], dim=-1).numpy())
-    assert not verify_study(folder).differs
+    confirmed = verify_study(folder)
+    assert not confirmed.differs and "9 rows of vehicles.parquet confirmed" in confirmed_text([confirmed])
+    _check_that_changes_of_vehicles_show(folder, rows)
     files = [path.name for path in write_export(folder, layouts=[1])]
     assert files == ["gco-1-0.csv", "gco-1-1.csv", "gco-1-2.csv"]
     table = pd.read_csv(folder / "export" / files[2])
@@ -44,6 +48,23 @@ def test_a_study_of_fleets(run, run_until, tmp_path) -> None:
     page = (folder / "view.html").read_text()
     assert [one["name"] for one in part(page, "head")["solvers"]] == ["vehicle 0", "vehicle 1", "vehicle 2"]
     assert run(*WORDS, "hydra.run.dir=out")[1].startswith("Already done")
+
+
+def _check_that_changes_of_vehicles_show(folder: Path, rows: pd.DataFrame) -> None:
+    """They passed as confirmed: no one looked at this table."""
+    path, random = folder / "vehicles.parquet", np.random.default_rng(0)
+    for name in rows.columns:
+        changed, i = rows.copy(), random.integers(len(rows))
+        others = {"b": not changed[name].iloc[i], "i": 7, "f": 0.5}
+        changed.loc[i, name] = others.get(changed[name].dtype.kind, "al_ilqr")
+        changed.to_parquet(path, index=False)
+        verified = verify_study(folder)
+        assert verified.differs and f"{path}: 1 value differs in 9 rows" in confirmed_text([verified])
+    rows.iloc[1:].to_parquet(path, index=False)
+    assert verify_study(folder).differs
+    path.unlink()
+    assert f"not confirmed: {path}, which is missing" in confirmed_text([verify_study(folder)])
+    rows.to_parquet(path, index=False)
 
 
 @pytest.mark.slow

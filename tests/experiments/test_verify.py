@@ -13,6 +13,7 @@ import pytest
 from tests.experiments.commands import problem_line
 from tests.slow import mostly
 from torchgco.experiments.reports.report import main
+from torchgco.experiments.reports.verify import _differences
 
 WORDS = ["solver=al_ilqr", "study.baselines=[hold]", "study.layouts=3", "scenario.stages=8", "study.workers=1"]
 WORDS += ["study.figures=false"]
@@ -215,3 +216,11 @@ def test_missions_are_confirmed_as_far_as_their_log_goes(flown, capsys) -> None:
     (flown / "mission.parquet").unlink()
     assert main(["--verify", str(flown)]) == 2
     assert "mission.parquet" in problem_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("held", [0.5, -3.0, 1e300, -np.inf, np.nan, None])
+def test_a_number_is_not_infinite(held: float | None) -> None:
+    """A distance was confirmed, whatever it said, where there is nothing to keep one from."""
+    kept, computed = pd.DataFrame({"clearance": [np.inf, held]}), pd.DataFrame({"clearance": [np.inf, np.inf]})
+    kept.index = computed.index = pd.MultiIndex.from_product([["gco"], [0, 1]], names=["solver", "layout"])
+    assert _differences(kept.astype(float), computed)["layout"].tolist() == [1]

@@ -173,3 +173,12 @@ def test_a_body_whose_inside_fits_through_no_way_is_told() -> None:
     text = told(Problem(held.dynamics, held.cost, [field, held.constraints[1]], held.x0, 80, held.goal))
     assert f"leads the ball inside the body, of radius {body.inscribed_radius:.3g} m to the goal" in text
     assert "a narrower body" in text and "vehicle_radius" not in text
+
+
+@pytest.mark.parametrize("broken", [(0, np.nan), (1, np.inf), (1, -np.inf), (2, np.nan)])
+def test_a_start_that_is_no_place_is_told(broken: tuple[int, float]) -> None:
+    """The explanation was an error of NumPy."""
+    task = problem(room(), 0.2)
+    starts = task.x0.clone()
+    starts[0, broken[0]] = broken[1]
+    assert "NON_FINITE" in told(replace(task, x0=starts))

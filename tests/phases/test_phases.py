@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -252,6 +253,23 @@ def test_single_precision() -> None:
     )
     assert solution[0].X.dtype == torch.float32 and bool(torchgco.judge(phases, solution).feasible.all())
     torch.testing.assert_close(solution.cost.double(), solved(double).cost, rtol=1e-5, atol=0.0)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_loop_has_numbers_in_single_precision(seed: int) -> None:
+    """The judge refused them."""
+    draw = torch.Generator().manual_seed(seed)
+    starts, gap = torch.zeros(2, 4), 1.0 + torch.rand(2, 1, generator=draw)
+    loop = Link(lambda a, b, gap: a + gap - b, components=[0], values={"gap": gap})
+    back = torch.ones(4, dtype=torch.bool)
+    phases = Phases([drive(starts, [1.0, 0.0], free_start=back), drive(starts, [0.0, 1.0])], loop=loop)
+    solution = torchgco.solve(phases)
+    verdict = torchgco.judge(phases, solution)
+    assert bool(verdict.feasible.all())
+    torch.testing.assert_close(solution[1].X[:, -1, :1] - solution[0].X[:, 0, :1], gap, rtol=0, atol=1e-4)
+    short = torchgco.judge(Phases(phases.problems, loop=replace(loop, values={"gap": gap + 0.01})), solution)
+    assert not bool(short.feasible.any())
+    torch.testing.assert_close(short.violation, torch.full((2,), 0.01, dtype=D), rtol=0, atol=1e-4)
 
 
 def test_slopes_of_rows_are_those_of_autodiff() -> None:

@@ -70,6 +70,24 @@ def test_a_notebook_plays_it_with_a_body() -> None:
     assert "<script" in film._repr_html_()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_is_where_it_is_then(seed: int) -> None:
+    """Between two knots it stood at the first one, up to a stage behind what moves beside it."""
+    random, dt = np.random.default_rng(seed), 0.5
+    body, start = Body.covering([-0.2, -0.1], [0.3, 0.1], [2, 1]), torch.tensor([[0.0, 0.0, 0.4, 1.0]]).double()
+    cost = QuadraticCost([0.0] * 4, [0.1] * 2, [1.0, 1.0, 0.0, 1.0])
+    stated = Problem(torchgco.Unicycle(dt=dt), cost, [Spheres([[9.0, 9.0]], [0.2], body)], start, 4)
+    given = torch.tensor(random.uniform(-0.5, 0.5, (1, 4, 2)))
+    solution = torchgco.solve(stated, given, solver="hold", verbose=False)
+    film, X = torchgco.animate(stated, solution), solution.X[0].numpy()
+    for t in random.uniform(0.0, 4 * dt, 6):
+        x, y, heading, _ = (np.interp(t, dt * np.arange(5), component) for component in X.T)
+        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        corners = np.array([[-0.2, -0.1], [-0.2, 0.1], [0.3, -0.1], [0.3, 0.1]]) @ turn.T + [x, y]
+        (outline,) = [shape.get_path().vertices[:-1] for shape in film.at(t) if isinstance(shape, Polygon)]
+        assert np.linalg.norm(outline[:, None] - corners, axis=-1).min(0).max() < 1e-9
+
+
 def test_wrong_calls_are_told() -> None:
     stated = problem(MOVING)
     solution = torchgco.solve(stated, solver="hold", verbose=False)

@@ -80,3 +80,18 @@ def test_times_stay_within_their_bounds() -> None:
     solution = solve(problem, verbose=False)
     assert bool(judge(problem, solution.U, times=solution.t).reached.all())
     assert bool(((solution.duration >= 6.5 - 1e-6) & (solution.duration <= 7.0 + 1e-6)).all())
+
+
+@pytest.mark.parametrize("broken", [(0, np.nan), (1, np.inf), (3, np.nan), (2, -np.inf)])
+def test_a_start_that_is_no_place_is_its_own_problems_alone(broken: tuple[int, float]) -> None:
+    """It ended the solve of the whole batch with an error of NumPy."""
+    lane, end = lanes(1, 3, 1.0), [3.0, 0.0, 0.0, 0.0]
+    cost = QuadraticCost([0.0] * 4, [0.1] * 2, [0.0] * 4, x_ref=end)
+    parts = [Spheres([[1.5, -0.5]], 0.4, 0.1, [[0.0, 0.5]]), ControlBounds(-4.0, 4.0)]
+    free, goal = FreeTime(0.5, 2.0, weight=0.1), Goal(end[:2], 0.2, required=True)
+    starts = torch.zeros(2, 4, dtype=D)
+    starts[0, broken[0]] = broken[1]
+    both, sound = (Problem(lane.dynamics, cost, parts, x0, 15, goal, time=free) for x0 in (starts, starts[1:]))
+    solution, alone = solve(both, verbose=False), solve(sound, ids=torch.tensor([1]), verbose=False)
+    assert [status.name for status in solution.statuses] == ["NON_FINITE", "CONVERGED"]
+    assert torch.equal(solution.U[1], alone.U[0]) and torch.equal(solution.duration[1], alone.duration[0])

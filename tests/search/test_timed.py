@@ -194,3 +194,15 @@ def test_lattices_have_few_moves_and_states_at_any_scale(scale: float, fast: flo
         assert len(lattice.velocities) <= MOVES and lattice.states <= STATES
         assert lattice.velocities[:, 0].max() >= 0.7 * speed and lattice.spacing >= 0.3 * scale * 0.999
         assert np.all(lattice.points.min(0) <= 0.0) and lattice.points[:, 0].max() >= way - lattice.spacing
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_default_of_double_precision_changes_nothing(seed: int) -> None:
+    """C reads clearances and costs of ways in single precision: in double, the first search ended the solve."""
+    found, default = solved(traffic(seed, B=2)), torch.get_default_dtype()
+    torch.set_default_dtype(D)
+    try:
+        again = solved(traffic(seed, B=2))
+    finally:
+        torch.set_default_dtype(default)
+    assert torch.equal(found.U, again.U) and torch.equal(found.status, again.status)

@@ -468,3 +468,18 @@ def test_what_looks_convex_at_a_held_time_is_solved_once() -> None:
         one = replace(problem, constraints=[*problem.constraints, FunctionConstraint(row)])
         assert looks_convex(one, X, U).tolist() == [convex] * 3
     assert not bool(looks_convex(braking(3, 1), torch.zeros(3, 41, 4, dtype=D), torch.zeros(3, 40, 1, dtype=D)).any())
+
+
+@pytest.mark.filterwarnings("ignore::torchgco.HorizonWarning")
+@pytest.mark.parametrize("most", [0.05, 0.4, 0.8])
+@pytest.mark.parametrize("name", ["gco", "gco_max", "gco_fast", "interior_point"])
+def test_a_time_that_is_too_short_for_all_or_some(name: str, most: float) -> None:
+    """Where none of a batch converged, the search for other minima ended the solve with an error of PyTorch."""
+    problem = carts(N=20, B=6, most=most)
+    found = torchgco.solve(problem, solver=name, verbose=False)
+    possible = torch.from_numpy(least_time(problem.x0)) <= 3.0 * most
+    assert [status.name == "CONVERGED" for status in found.statuses] == possible.tolist()
+    assert bool((found.violation[~possible] > 1e-3).all())
+    late = (~possible).nonzero().flatten()
+    alone = torchgco.solve(problem.take(late), solver=name, ids=late, verbose=False)
+    assert_same_bits(alone, found.take(late))

@@ -70,15 +70,18 @@ class PathPursuit(Solver, named="solver"):
         """Find a path for each problem, pursue it, and solve."""
         session, admitted = Session(call, own_units=True), self.solver.admitted(call.problem)
         scaled = session.call
-        U, has_path = self.guess(scaled.problem, scaled.U0)
+        U, has_path = self.guess(scaled.problem, scaled.U0, call)
         scaled = replace(scaled, U0=U)
         guess = guessed(scaled)
         end = self._cleared(scaled, self.solver.no_worse(scaled, guess, self.solver.solved(scaled, guess=guess)))
         solution = session.finished(least_violated(scaled, end, admitted), admitted)
         return replace(solution, guided=has_path.long())
 
-    def guess(self, problem: Problem, U0: Tensor) -> tuple[Tensor, Tensor]:
+    def guess(self, problem: Problem, U0: Tensor, call: Call | None = None) -> tuple[Tensor, Tensor]:
         """Controls (B, N, m) along the paths, and where (B,) there is one; else U0.
+
+        Args:
+            call: whose time may be over before all paths are sought.
 
         Raises:
             InputError: as the class says.
@@ -87,6 +90,8 @@ class PathPursuit(Solver, named="solver"):
         U, has_path = U0.clone(), torch.zeros_like(problem.x0[:, 0], dtype=torch.bool)
         sound = problem.start_is_clear & torch.isfinite(problem.x0).all(-1)
         for b in sound.nonzero().flatten().tolist():
+            if call is not None and call.late:
+                break
             row = torch.tensor([b], device=problem.x0.device)
             single = problem.take(row)
             track = self._track(single, None if scene is None else scene.take(row))

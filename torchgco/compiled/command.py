@@ -12,6 +12,7 @@ from torchgco.base.draws import DrawKey
 from torchgco.base.numbers import as_floats, measured
 from torchgco.base.options import Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
+from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.numbers import Numbers
 from torchgco.compiled.stages import stage_of
@@ -31,7 +32,8 @@ class MPPIController:
 
     Where pytorch_mppi has num_samples, noise_sigma (a matrix), lambda_, horizon and U_init, here are `MPPI.samples`,
     `covariance` (its diagonal), `temperature`, the problem's N, and `reset(U)`. Samples that touch an obstacle pay a
-    penalty; other constraints than the bounds of controls don't count, as in `MPPI`.
+    penalty; other constraints than the bounds of controls don't count, as in `MPPI`. Obstacles that move go on by
+    themselves where a command doesn't say where they are.
 
     Args:
         problem: B vehicles; its start isn't used. Of a GPU, samples run there with the extra `cuda`, else on the CPU.
@@ -57,8 +59,8 @@ class MPPIController:
         self.sampler = check_value(sampler or MPPI(), MPPI, "sampler")
         self.sampler.check(problem)
         self.seed, self.period = check_value(seed, Seed, "seed"), check_value(period, Seconds | None, "period")
-        dt = stage_of(problem)
-        self._stages = 1 if self.period is None else stages_between(self.period / dt)
+        self._dt, self._motion, self._t = stage_of(problem), Motion(problem), 0.0
+        self._stages = 1 if self.period is None else stages_between(self.period / self._dt)
         with torch.inference_mode(False), computing_on(CPU):
             self._problem, self._ids = with_own_numbers(problem), torch.arange(problem.B)
         self.numbers = Numbers(numbers_of(self._problem), lambda number: None)
@@ -81,6 +83,7 @@ class MPPIController:
                 check_tensor(plan, "U")
                 plan = plan.expand_as(blank)
         self.U, self._commands = plan.clone(), 0
+        self._motion.forget()
 
     def command(self, x: Any, *, shift: bool = True, numbers: Mapping[str, Any] | None = None, **named: Any) -> Tensor:
         """The controls (B, m) for the next period from states x (B, n); (m,) for x (n,) of one vehicle.
@@ -95,7 +98,11 @@ class MPPIController:
                 and that mixes knots or vehicles along the plan.
         """
         state, B = measured(x, *self._problem.x0.shape), self._problem.B
-        self.numbers.write(self.numbers.named(numbers, named, {"x0": state}))
+        t = self._t + (self.period or self._dt) * bool(shift and self._commands)
+        values = self.numbers.named(numbers, named, {"x0": state})
+        self.numbers.write(self._motion.numbers(self._problem, t, values))
+        self._motion.keep(self._problem, t)
+        self._t = t
         with torch.no_grad(), torch.inference_mode(False), computing_on(CPU), served_by(self._device):
             before = shifted(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))

@@ -35,7 +35,8 @@ class FleetMPC:
 
     No vehicle knows what others plan now. A new plan is flown only if it is apart, between the knots too, from the
     plans in force, and only then is it in force itself; else the vehicle goes on by its own. So what all fly is a set
-    of plans that has been checked, as long as measured states are those of the plans.
+    of plans that has been checked, as long as measured states are those of the plans. Obstacles that move go on by
+    themselves.
 
     Args:
         fleet: with starts where the vehicles are at first.
@@ -48,7 +49,7 @@ class FleetMPC:
         adopted: which vehicles fly a plan of the last step, (B, V) bool.
 
     Raises:
-        InputError: as `MPC`; first plans that aren't apart or not feasible.
+        InputError: as `MPC`; a cost with rows per knot; first plans that aren't apart or not feasible.
     """
 
     adopted: Tensor
@@ -58,6 +59,10 @@ class FleetMPC:
     ) -> None:
         if not isinstance(fleet, Fleet):
             raise InputError("fleet", "a Fleet", type(fleet).__name__)
+        for v, one in enumerate(fleet.members):
+            if names := sorted(one.cost.names_by_stage()):
+                expected = "one for all knots: a step takes no new ones, and begins at knot 0 again"
+                raise InputError(f"fleet.vehicles[{v}].cost.{names[0]}", expected, "a row per knot")
         limit = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
         self.fleet, self.t = fleet, 0.0
         self.first: FleetSolution = solve(fleet, max_seconds=None if limit == torch.inf else limit)
@@ -81,7 +86,7 @@ class FleetMPC:
         Raises:
             InputError: states of other vehicles.
         """
-        if isinstance(x, Tensor) or len(x) != self.fleet.V:
+        if not isinstance(x, Sequence) or len(x) != self.fleet.V:
             raise InputError("x", f"states (B, n) of each of {self.fleet.V} vehicles", shown(x))
         states = [torch.as_tensor(part, dtype=torch.float64) for part in x]
         for v, (one, state) in enumerate(zip(self.fleet.members, states, strict=True)):

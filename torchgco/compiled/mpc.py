@@ -17,8 +17,9 @@ from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.status import Status
 from torchgco.compiled.answer import Answer
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled, compile
+from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbers import Numbers
-from torchgco.compiled.stages import check_loop_in_free_time, follows, stage_of
+from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, stage_of
 from torchgco.kernels import held_on_cpu
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, held
@@ -38,7 +39,9 @@ class MPC:
     can be flown then, and after it the solver does. Where all fail or are late, a vehicle flies the plan before with
     feedback on the measured state, if the constraints of now allow that, else what comes to rest, else what breaks them
     least. All controls are within their bounds. `RateBounds` with a `previous` count from the controls that were
-    returned last.
+    returned last; where a period is shorter than a stage they have a row per knot, and the first one allows as much of
+    a stage's change as the period is of the stage. Obstacles that move go on by themselves where a step doesn't say
+    where they are.
 
     Where the time is free, a plan lasts as long as is left of the one before, or as is best. Controls are the plan's
     means over the next period, and of stages that are longer those of the first.
@@ -62,8 +65,9 @@ class MPC:
         answer: the last solve's `Answer`, whether it is flown or not; None before the first step.
 
     Raises:
-        InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem, or free starts. Where
-            the time is free: a shortest duration below a period, `RateBounds` with a `previous`.
+        InputError: as `torchgco.compile`; stages that differ in length, horizons of each problem, free starts, or
+            obstacles that move without numbers that say where they are. Where the time is free: a shortest duration
+            below a period, `RateBounds` with a `previous`.
     """
 
     def __init__(
@@ -90,12 +94,16 @@ class MPC:
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
         self._previous = [f"constraints[{i}].previous" for i, c in enumerate(problem.constraints) if follows(c)]
-        changes = None if changes is None else ["x0", *self._previous, *changes]
+        if self._previous and self.period < self.dt:
+            asked, problem = (in_periods(one, self.period / self.dt) for one in (asked, problem))
+        self._motion = Motion(problem)
+        places = self._motion.places
+        changes = None if changes is None else ["x0", *self._previous, *places, *changes]
         self.compiled: Compiled = compile(asked, solver, changes, tolerance=tolerance)
         self._problem, self._limit = problem, self.max_seconds
         if self._limit is None and period is not None:
             self._limit = self.period
-        self._at_first = {name: self.numbers[name] for name in self._previous}
+        self._at_first = {name: self.numbers[name] for name in (*self._previous, *places)}
         self.reset()
 
     def reset(self) -> None:
@@ -106,6 +114,7 @@ class MPC:
         self._begun = np.zeros(self._problem.B)
         self._u: Tensor | None = None
         self.numbers.write(self._at_first)
+        self._motion.forget()
 
     t: float
     answer: Answer | None
@@ -185,12 +194,14 @@ class MPC:
         first, limit = self.answer is None, self.max_seconds if self.answer is None else self._limit
         limit = limit if max_seconds is None else max_seconds
         later = 0.0 if first else self.period if t is None else now - self.t
+        values = self._motion.numbers(self.compiled.problem, now, values)
         moved = {"elapsed": later} if self._free else {"shift": stages_between(later / self.dt)}
         known = dict[int, Held]()
         answer = self.compiled.call(
             values, not first, **moved, max_seconds=None if limit == np.inf else limit,
             begin=None if first or self._free else lambda problem, rows: self._known(problem, rows, now, known),
         )  # fmt: skip
+        self._motion.keep(self.compiled.problem, now)
         ended = answer.status.numpy()
         solved = (ended == CONVERGED) | (ended == FEASIBLE)
         self._held, self._feasible = ~solved, solved.copy()

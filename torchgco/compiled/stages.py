@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -48,6 +49,22 @@ def check_loop_in_free_time(problem: Problem, period: float) -> None:
 def follows(part: Any) -> bool:
     """Whether a constraint counts from the controls before."""
     return part.joins_knots and getattr(part, "previous", None) is not None
+
+
+def in_periods(problem: Problem, share: float) -> Problem:
+    """The problem in a loop whose periods are a share of a stage.
+
+    Controls may change by as much of what they may change from stage to stage: else they could in every period by all
+    of it. The bounds have a row per knot.
+    """
+    rows: list[Any] = list(problem.constraints)
+    for i, part in enumerate(rows):
+        if follows(part) and part.holds_at(0):
+            knots = torch.arange(problem.N, device=problem.x0.device)[part.knots]
+            shares = torch.where(knots == 0, share, 1.0).to(problem.x0).unsqueeze(-1)
+            lower, upper = (bound * shares for bound in part.by_knot)
+            rows[i] = replace(part, lower=lower, upper=upper)
+    return replace(problem, constraints=rows)
 
 
 def _check_no_gates(problem: Problem) -> None:

@@ -78,6 +78,8 @@ class BetweenKnots(Constraint):
             )
         stages = torch.arange(dims.N + 1, device=dims.like.device)[own.knots] - (0 if _of_stages(own) else 1)
         counted = (stages >= 0).nonzero().flatten()
+        if len(counted) == 0:
+            raise InputError("between_knots.constraint", "a constraint of a knot at which a stage ends", "knot 0 alone")
         return replace(self, constraint=own, model=dims.model, stages=stages[counted], counted=counted)
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:

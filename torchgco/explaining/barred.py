@@ -35,7 +35,7 @@ def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]
     fields = [field for field in problem.obstacles if field.map is not None]
     if status is Status.INVALID_START:
         return {"in_unknown": any(_is_unknown(problem, field.map) for field in fields if field.body is None)}
-    if arrived or problem.goal is None:
+    if arrived or problem.goal is None or not bool(problem.x0[:, problem.position].isfinite().all()):
         return {}
     facts = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]
     return min(facts, key=lambda fact: fact["passage"], default={})

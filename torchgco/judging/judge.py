@@ -268,18 +268,24 @@ def more_columns(problem: Problem, verdict: Verdict) -> dict[str, Any]:
 def columns(problem: Problem, U: Tensor, start: Tensor | None = None, times: Tensor | None = None) -> dict[str, Any]:
     """What can be judged of controls U (B, N, m) without being given more than the problem, as columns of a table.
 
-    `clearance` (m) where the problem has obstacles, `reached` where it has a goal, and `more_columns`; a problem of
-    another precision is judged in float64; `start` and `times` as in `judge`.
+    Those of `judged_columns`; a problem of another precision is judged in float64; `start` and `times` as in `judge`.
 
     Raises:
         InputError: as `judge`.
     """
     problem = current_problem(problem)
+    if not _names(problem) and not has_gates(problem) and not path_rows(problem):
+        return {}
+    return judged_columns(problem, judge(problem, U, start=start, times=times))
+
+
+def judged_columns(problem: Problem, verdict: Verdict) -> dict[str, Any]:
+    """`clearance` (m) where the problem has obstacles, `reached` where it has a goal, and `more_columns`."""
+    values = {name: getattr(verdict, name).cpu().numpy() for name in _names(problem)}
+    return values | more_columns(problem, verdict)
+
+
+def _names(problem: Problem) -> list[str]:
     names = ["clearance"] if any(isinstance(c, Distance) for c in problem.constraints) else []
     names += ["reached"] if problem.goal is not None else []
-    names = names if problem.dynamics.position is not None else []
-    if not names and not has_gates(problem) and not path_rows(problem):
-        return {}
-    verdict = judge(problem, U, start=start, times=times)
-    values = {name: getattr(verdict, name).cpu().numpy() for name in names}
-    return values | more_columns(problem, verdict)
+    return names if problem.dynamics.position is not None else []

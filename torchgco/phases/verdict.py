@@ -64,7 +64,7 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
                 cost, violation = cost + jump.costs(end, v), torch.maximum(violation, jump.violation(end, v))
                 start = jump.after(end, v)
         if phases.loop is not None and end is not None:
-            violation = torch.maximum(violation, _open(phases, solution[0].X[:, 0].double(), end))
+            violation = torch.maximum(violation, _open(phases, solution[0].X[:, 0], end))
         return _joined(phases, verdicts, cost, violation)
 
 
@@ -72,8 +72,8 @@ def _open(phases: Phases, first: Tensor, last: Tensor) -> Tensor:
     """By how much a loop isn't closed from the first state (B, n) to the last (B, n'), (B,)."""
     assert phases.loop is not None
     n = min(first.shape[-1], last.shape[-1])
-    row = phases.loop.bind(Dimensions(len(first), 1, n, 1, None, None, first))
-    return row.worst(torch.stack((first[:, :n], last[:, :n]), dim=1), first.new_zeros(len(first), 1, 1))
+    row = cast(phases.loop.bind(Dimensions(len(first), 1, n, 1, None, None, first)), torch.float64)
+    return row.worst(torch.stack((first[:, :n].double(), last[:, :n]), dim=1), last.new_zeros(len(last), 1, 1))
 
 
 def _end(problem: Problem, U: Tensor, times: Tensor | None, start: Tensor) -> Tensor:

@@ -121,7 +121,7 @@ def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float) -> 
             radius = world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
             drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
     if world.body is not None:
-        state = course.X[int(past.sum()) - 1 : int(past.sum())]
+        state = np.array([[np.interp(t, course.t, component) for component in course.X.T]])
         if not np.isfinite(state).all():
             return drawn
         look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}

@@ -155,7 +155,7 @@ class TimedScene:
             radius=field.radius, clearance=field.away.clone(), cell_cost=self.cell_cost, end_cost=self.end_cost,
             move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most, tries=TRIES, found=0,
             way=torch.empty(most, a.layers + 1, dtype=torch.int32), end=torch.empty(most, dtype=torch.int32),
-            cost=torch.empty(most),
+            cost=torch.empty(most, dtype=torch.float32),
         )  # fmt: skip
 
 
@@ -235,7 +235,7 @@ def _present(solids: Solids, count: int) -> list[Tensor]:
 
 def _away(parts: Sequence[Any], lattice: TimedLattice, times: Tensor) -> Tensor:
     """Distances (T, cells), float32, m, of the cells at times (T,) from obstacles of any kinds."""
-    found = torch.full((len(times), lattice.cells), torch.inf)
+    found = torch.full((len(times), lattice.cells), torch.inf, dtype=torch.float32)
     points = torch.from_numpy(lattice.points).float().unsqueeze(0)
     for part in cast(list(parts), torch.float32):
         if part.absent.numel() > 0:

@@ -54,9 +54,10 @@ class Arrivals:
         """
         X = _free(call)
         factors = factors_in(problem, X)[:, 0]
+        sound = torch.isfinite(problem.x0).all(-1).tolist()  # no way leads from NaN
         found: list[TimedWays] = [TimedWays([], X.new_zeros(0).numpy(), 1.0) for _ in range(problem.B)]
         for finer in FINER:
-            left = [b for b, ways in enumerate(found) if not ways.points]
+            left = [b for b, ways in enumerate(found) if sound[b] and not ways.points]
             for first in range(0, len(left), PROBLEMS_AT_ONCE):
                 rows = left[first : first + PROBLEMS_AT_ONCE]
                 scenes = [_scene(problem, b, X[b], float(factors[b]), finer) for b in rows]

@@ -9,12 +9,15 @@ import torch
 
 from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import AtLeast, Count, check_options
+from torchgco.base.status import STALLED, Status
 from torchgco.guidance.mppi import diagonal
 from torchgco.search.best import Best
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Solver
 from torchgco.solvers.session import Session
+
+GAVE_UP = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, STALLED  # where another guess might have done
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,12 @@ class MultiStart(Solver):
         left = call.problem.start_is_clear & torch.isfinite(call.problem.x0).all(-1)  # no guess helps an invalid start
         for start in range(1, self.starts):
             rows = (left if self.budget is None else left & (best.end.iterations < self.budget)).nonzero().flatten()
-            if rows.numel() == 0 or call.late:
+            if rows.numel() == 0:
+                break
+            if call.late:
+                ended = best.end.status[rows]
+                gave_up = torch.stack([ended == reason for reason in GAVE_UP]).any(0)
+                best.end.status[rows] = torch.where(gave_up, int(Status.TIME_LIMIT), ended)
                 break
             part = scaled.take(rows)
             key = DrawKey(call.seed, part.ids, torch.full_like(rows, start))

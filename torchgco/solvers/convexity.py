@@ -40,6 +40,8 @@ def _convex(
     problem: Problem, X: Tensor, U: Tensor, values_of: Callable[[Tensor, Tensor], list[tuple[Tensor, bool]]]
 ) -> Tensor:
     """Whether values (B, ...) along segments around X, U are convex, or where they must be, affine, (B,) bool."""
+    if len(X) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=X.device)
     size = X.amax(1, keepdim=True) - X.amin(1, keepdim=True)
     size = torch.where(size > 0, size, 1.0)
     convex = torch.isfinite(X).flatten(1).all(-1)

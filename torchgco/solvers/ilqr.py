@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,7 +63,8 @@ class ILQR(Solver, named="ilqr"):
         problem, warm = session.call.problem, session.call.warm
         fixed = Multipliers.zero(problem, 0.0) if warm is None else warm
         lagrangian = Lagrangian(problem, fixed, None, phr=False)
-        s, status = descend(self, lagrangian, session.call.U0, start_is_clear=problem.start_is_clear)
+        late = None if call.deadline is None else lambda: call.late
+        s, status = descend(self, lagrangian, session.call.U0, start_is_clear=problem.start_is_clear, late=late)
         end = Iterate(s.X, s.U, fixed, s.cost, measured(problem, s.X, s.U))
         # Multipliers are fixed: a trajectory that has converged and isn't feasible stays so.
         done = (status == Status.MAX_ITERATIONS) & (s.inner < self.max_iterations)
@@ -73,12 +75,19 @@ class ILQR(Solver, named="ilqr"):
 
 
 def descend(
-    inner: ILQR, lagrangian: Lagrangian, U: Tensor, start_is_clear: Tensor | None = None
+    inner: ILQR,
+    lagrangian: Lagrangian,
+    U: Tensor,
+    start_is_clear: Tensor | None = None,
+    late: Callable[[], bool] | None = None,
 ) -> tuple[InnerState, Tensor]:
     """One inner solve of each problem from controls U (B, N, m); returns the end states and the statuses (B,).
 
     A problem whose L_M isn't finite, or whose `start_is_clear` (B,) is False, stays as it starts. Tolerances are in the
     units of the problem's cost.
+
+    Args:
+        late: whether the time is over, asked before each iteration; with `start_is_clear`.
     """
     problem, kernels = lagrangian.problem, kernels_of(lagrangian.problem)
     rows = torch.arange(problem.B, device=U.device)
@@ -96,12 +105,15 @@ def descend(
         X, cost, merit = kernels.begun(lagrangian, U)
         whole = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
         status = start_status(problem, X, merit, start_is_clear)
-    running, going = whole, status == Status.RUNNING
+    running, going, limit = whole, status == Status.RUNNING, inner.max_iterations if late is None else 1
     while (stay := going.nonzero().flatten()).numel() > 0:
+        if late is not None and late():
+            status[running.rows[stay]] = Status.TIME_LIMIT
+            break
         if stay.numel() < going.numel():
             running, lagrangian = take(running, stay), lagrangian.take(stay)
         kernels = kernels_of(lagrangian.problem)
-        now = _status(kernels.descend(lagrangian, running, inner.descent, inner.max_iterations))
+        now = _status(kernels.descend(lagrangian, running, inner.descent, limit))
         status[running.rows], going = now, now == Status.RUNNING
         if running is not whole:
             put(whole, running.rows, running)

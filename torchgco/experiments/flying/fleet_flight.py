@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +17,15 @@ from torchgco.base.status import Status
 from torchgco.experiments.config.build import Setup
 from torchgco.experiments.flying.flight import Schedule, SolveBatch, plan_of
 from torchgco.experiments.flying.mission_flight import SINGLE
+from torchgco.fleets.drawn import solution_of
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.solution import FleetSolution
 from torchgco.fleets.verdict import FleetVerdict
 from torchgco.kernels import native
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import Layouts, Vehicle
 
 AT_ONCE = 8  # fleets that plan side by side, at most: their linear responses fill memory
+VEHICLES = "vehicles.parquet"  # a row per solver, fleet and vehicle
+JUDGED_AT_ONCE = 64  # fleets
 EMPTY = (*(name for name in SINGLE if name != "cost"), "clearance_knots")  # columns that belong to a single vehicle
 
 
@@ -34,16 +37,18 @@ def fleet_columns(verdict: FleetVerdict) -> dict[str, Any]:
     return {name: getattr(verdict, name).numpy() for name in names} | more
 
 
-def vehicle_rows(layouts: Layouts, found: FleetSolution, solver: str) -> list[dict[str, Any]]:
-    """A row for each vehicle of each fleet."""
-    names = ("feasible", "reached", "cost", "violation", "clearance", "goal_distance")
-    rows = []
-    for b, number in enumerate(layouts.ids.tolist()):
-        for v, one in enumerate(found.verdict.vehicles):
-            own = {name: getattr(one, name)[b].item() for name in names}
-            apart = bool(found.verdict.apart[b, v])
-            rows.append({"solver": solver, "layout": number, "vehicle": v, "apart": apart, **own})
-    return rows
+def vehicles_table(vehicle: Vehicle, layouts: Layouts, controls: Mapping[str, np.ndarray]) -> pd.DataFrame:
+    """A row for each vehicle of each fleet, of controls (L, N, V m) by the names of solvers."""
+    names, rows = ("feasible", "reached", "cost", "violation", "clearance", "goal_distance"), list[dict[str, object]]()
+    for solver, U in controls.items():
+        for places in layouts.together(JUDGED_AT_ONCE):
+            some = layouts.take(places)
+            verdict = solution_of(vehicle, some, U[places]).verdict
+            for b, number in enumerate(some.ids.tolist()):
+                for v, one in enumerate(verdict.vehicles):
+                    own, apart = {name: getattr(one, name)[b].item() for name in names}, bool(verdict.apart[b, v])
+                    rows.append({"solver": solver, "layout": number, "vehicle": v, "apart": apart, **own})
+    return pd.DataFrame(rows)
 
 
 def check_fleets(setup: Setup, layouts: Layouts, plan: Schedule) -> None:

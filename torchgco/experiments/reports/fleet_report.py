@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
-from torchgco.experiments.flying.fleet_flight import vehicle_rows
+from torchgco.experiments.flying.fleet_flight import VEHICLES, vehicles_table
 from torchgco.experiments.flying.progress import draw
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.results.files import write
@@ -20,21 +19,14 @@ from torchgco.plotting.fleets import fleet_animation, fleet_figure
 from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts, Vehicle
 
-VEHICLES = "vehicles.parquet"  # a row per solver, fleet and vehicle
 SHOWN = 4  # fleets that get a picture and an animation, at most
-JUDGED_AT_ONCE = 64  # fleets
 
 
 def write_fleet_report(folder: Path, vehicle: Vehicle, layouts: Layouts, figures: bool = True) -> str:
     """Write vehicles.parquet, the tables and figures next to the `trials.parquet` in a folder; returns the table."""
     with np.load(folder / SOLUTIONS, allow_pickle=False) as flown:
         controls = dict(zip(flown["solver"].tolist(), flown["U"], strict=True))
-    rows = list[dict[str, object]]()
-    for name, U in controls.items():
-        for places in layouts.together(JUDGED_AT_ONCE):
-            some = layouts.take(places)
-            rows += vehicle_rows(some, solution_of(vehicle, some, U[places]), name)
-    table = pd.DataFrame(rows)
+    table = vehicles_table(vehicle, layouts, controls)
     write(folder / VEHICLES, lambda file: table.to_parquet(file, index=False))
     if figures:
         draw(_drawings(folder, vehicle, layouts.take(range(min(SHOWN, layouts.count))), controls))

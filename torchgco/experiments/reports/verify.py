@@ -1,8 +1,8 @@
 """Confirms the tables of finished studies from their stored controls, layouts and settings, and says what is confirmed.
 
 The controls of every row are simulated again, open-loop, with the model of study.json, and judged by `torchgco.judge`,
-which uses no solver code. Missions are confirmed from the log in mission.parquet, as far as it goes. Then
-summary.csv and paired.csv are counted again from the table.
+which uses no solver code. Missions are confirmed from the log in mission.parquet, as far as it goes, and fleets with
+the rows of their vehicles. Then summary.csv and paired.csv are counted again from the table.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pandas as pd
 import torch
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.flying.fleet_flight import fleet_columns
+from torchgco.experiments.flying.fleet_flight import VEHICLES, fleet_columns, vehicles_table
 from torchgco.experiments.flying.mission_flight import FAILED
 from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study
 from torchgco.experiments.results.durations import judged_columns
@@ -32,6 +32,7 @@ from torchgco.experiments.results.folder import (
 )
 from torchgco.experiments.results.identity import closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
+from torchgco.experiments.results.limits import read_table
 from torchgco.experiments.results.runs import below
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.results.variants import values_of
@@ -78,10 +79,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Verification:
-    """What was confirmed of one study: its trials.parquet, and where no row differs, summary.csv and paired.csv.
+    """What was confirmed of one study: its trials.parquet, and where no row differs, vehicles.parquet of fleets,
+    summary.csv and paired.csv.
 
     Args:
-        absent: of these two, those that should exist, but don't.
+        absent: of these, those that should exist, but don't.
     """
 
     folder: Path
@@ -138,8 +140,21 @@ def verify_study(folder: Path, trust: bool = False) -> Verification:
     others = tuple(str(name) for name in kept.columns if name not in computed.columns)
     trials = Table(TRIALS, len(kept), tuple(computed.columns), others, differences)
     # Of rows that differ, the tables that count them would differ, too.
-    counted, absent = _counted(folder, kept.reset_index()) if differences.empty else ([], ())
-    return Verification(folder, (trials, *counted), absent, study.missions)
+    if not differences.empty:
+        return Verification(folder, (trials,), (), study.missions)
+    (tables, lost), (counted, absent) = _vehicles(study), _counted(folder, kept.reset_index())
+    return Verification(folder, (trials, *tables, *counted), (*lost, *absent), study.missions)
+
+
+def _vehicles(study: Study) -> tuple[list[Table], list[str]]:
+    """What is confirmed of vehicles.parquet; and its name where it is absent."""
+    path, layouts = study.folder / VEHICLES, study.layouts
+    if layouts.vehicles is None or not path.is_file():
+        return [], [] if layouts.vehicles is None else [VEHICLES]
+    computed = vehicles_table(study.vehicle, layouts, study.controls)
+    return [
+        _compared(VEHICLES, readable(path, read_table, trust=study.trust), computed, pd.Index([*TRIAL, "vehicle"]))
+    ], []
 
 
 def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str, ...]]:
@@ -151,14 +166,19 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
             absent += [path.name] if len(table) else []
             continue
         stored, computed = readable(path, pd.read_csv), pd.read_csv(io.StringIO(csv_text(table)))
-        if list(stored.columns) != list(computed.columns) or len(stored) != len(computed):
-            shapes = (f"{len(frame)} rows, {len(frame.columns)} columns" for frame in (stored, computed))
-            differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
-        else:
-            keys = pd.MultiIndex.from_frame(computed[ROW_KEYS.intersection(computed.columns)])
-            differences = _differences(stored.set_axis(keys), computed.set_axis(keys))
-        tables.append(Table(path.name, len(computed), tuple(computed.columns), (), differences))
+        tables.append(_compared(path.name, stored, computed, ROW_KEYS))
     return tables, tuple(absent)
+
+
+def _compared(name: str, stored: pd.DataFrame, computed: pd.DataFrame, keys: pd.Index) -> Table:
+    """A table of which all columns are computed again, row by row; `keys` name a row."""
+    if list(stored.columns) != list(computed.columns) or len(stored) != len(computed):
+        shapes = (f"{len(frame)} rows, {len(frame.columns)} columns" for frame in (stored, computed))
+        differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
+    else:
+        index = pd.MultiIndex.from_frame(computed[keys.intersection(computed.columns)])
+        differences = _differences(stored.set_axis(index), computed.set_axis(index))
+    return Table(name, len(computed), tuple(computed.columns), (), differences)
 
 
 def _identity(study: Study, index: pd.MultiIndex) -> pd.DataFrame:
@@ -251,7 +271,7 @@ def _equal(stored: pd.Series, computed: pd.Series) -> np.ndarray:
         a, b = stored.to_numpy(dtype=float, na_value=np.nan), computed.to_numpy()
         with np.errstate(invalid="ignore"):  # infinite distances
             near = np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(b))
-        return near | (a == b) | (np.isnan(a) & np.isnan(b))
+        return (near & np.isfinite(b)) | (a == b) | (np.isnan(a) & np.isnan(b))
     a, b = stored.astype(object).to_numpy(), computed.astype(object).to_numpy()
     equal, known = pd.isna(a) & pd.isna(b), ~pd.isna(a) & ~pd.isna(b)
     equal[known] = (a[known] == b[known]).astype(bool)
@@ -269,7 +289,7 @@ def confirmed_text(studies: Sequence[Verification]) -> str:
             rows = _rows(study.tables[0].rows for study in of_kind)
             lines.append(f"{rows} of {'missions' if kind else 'trajectories'}:")
         lines += list(dict.fromkeys(f"  {line}" for study in of_kind for line in _columns(study)))
-    for name in ("summary.csv", "paired.csv"):
+    for name in (VEHICLES, "summary.csv", "paired.csv"):
         counted = [table.rows for study in right for table in study.tables if table.name == name]
         lines += [f"{_rows(counted)} of {name} confirmed"] if counted else []
     lines += [f"not confirmed: {study.folder / name}, which is missing" for study in right for name in study.absent]
