@@ -108,4 +108,4 @@ def _meaning(name: str, problem: Problem) -> str:
         return f"of {type(constraint).__name__}, knots {knots[0]} to {knots[-1]} by rows"
     units = {"X": states_of, "U": controls_of}.get(name, lambda _: [])(problem.dynamics)
     labels = ", ".join(quantity.label for quantity in units)
-    return MEANING[name] + (f": {labels}" if labels else "")
+    return MEANING.get(name, "a metric of the configuration") + (f": {labels}" if labels else "")

@@ -24,6 +24,7 @@ from torchgco.experiments.dataset.card import write_card
 from torchgco.experiments.dataset.rows import ABOUT, MAP, files_of, rows_of
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Batch, Flown, Schedule, SolveBatch, check_time, plan_of
+from torchgco.experiments.flying.metrics import check_metrics
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.together import cut, fly_all, trial_bar
 from torchgco.experiments.flying.workers import Shared
@@ -97,6 +98,7 @@ def make(folder: Path, words: Sequence[str], left_out: Sequence[LeftOut] = (), l
         raise InputError("scenario", "single vehicles for a data set", f"fleets of {setup.scenario.name}")
     task = tasks.of([0], exact=True)
     check_time(task, {setup.solver_name: setup.solver})
+    check_metrics(setup.metrics, task.problem, task.U0)
     command = [str(folder), *words]
     with held(folder, plan.job, plan.jobs), recorded(folder, setup, plan, command, COMMAND):
         _claim(folder, setup, left_out)

@@ -23,6 +23,7 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
+from torchgco.experiments.flying.metrics import metric_columns
 from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.results.durations import durations, with_lengths
@@ -233,6 +234,7 @@ class SolveBatch(Batch):
                 **self.shared, "layout": layouts.ids, "status": statuses, **frame_columns(verdict),
                 **durations(times), **more_columns(checked.problem, verdict),
                 **certificate_columns(certificate),
+                **metric_columns(setup.metrics, checked.problem, U, times, layouts.ids),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,

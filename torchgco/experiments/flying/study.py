@@ -18,6 +18,7 @@ from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.fleet_flight import FleetBatch, check_fleets
 from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, check_time, plan_of
+from torchgco.experiments.flying.metrics import check_metrics
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionBatch
 from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
@@ -185,6 +186,11 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
         check_fleets(setup, tasks.layouts, plan)
     else:
         task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
+    if setup.metrics:
+        if fleets or setup.mission is not None:
+            raise InputError("study.metrics", "null for missions and fleets", ", ".join(setup.metrics))
+        first = tasks.of(tasks.groups[0][:2], exact=True)
+        check_metrics(setup.metrics, first.problem, first.U0)
     if (objective := configuration["study"]["objective"]) is not None:
         check_objective(objective, setup.mission is not None)
         if plan.jobs is not None:

@@ -19,8 +19,9 @@ import pandas as pd
 import torch
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.config.build import vehicle_of
+from torchgco.experiments.config.build import metrics_of, vehicle_of
 from torchgco.experiments.flying.fleet_flight import fleet_columns
+from torchgco.experiments.flying.metrics import metric_columns
 from torchgco.experiments.flying.mission_flight import FAILED
 from torchgco.experiments.results.durations import durations, times_at
 from torchgco.experiments.results.files import damaged, readable
@@ -190,6 +191,7 @@ def _trajectories(
     """The judged columns of single trajectories, by (solver, layout)."""
     arrays = readable(folder / SOLUTIONS, read_npz, trust=trust)
     names, index = arrays["solver"].tolist(), {number: i for i, number in enumerate(arrays["layout"].tolist())}
+    metrics = metrics_of(manifest.configuration) if trust else {}  # functions of a user: their code runs
     parts, tasks = [], [vehicle.task(layouts.take(places)) for places in layouts.together(BATCH)]
     for name in manifest.solvers:
         controls = torch.from_numpy(arrays["U"][names.index(name)])
@@ -201,6 +203,8 @@ def _trajectories(
             verdict = judge(task.problem, controls[stored, : task.problem.N], task.goal, task.goal_radius, times=times)
             columns = {"solver": name, "layout": ids, **frame_columns(verdict)}
             more = durations(times) | more_columns(task.problem, verdict)
+            U = controls[stored, : task.problem.N]
+            more |= metric_columns(metrics, task.problem, U, times, None)
             parts.append(pd.DataFrame(columns | more))
     rows = with_success(pd.concat(parts, ignore_index=True), layouts, len(manifest.solvers))
     return rows.set_index(TRIAL)[[*frame_columns(verdict), *more, "success", "best_cost", "best_from"]]
