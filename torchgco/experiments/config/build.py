@@ -265,10 +265,12 @@ def metrics_of(configuration: Mapping[str, Any]) -> dict[str, Callable[..., Any]
     nodes = configuration["study"].get("metrics") or {}
     if not isinstance(nodes, Mapping):
         raise InputError("study.metrics", "functions by name, such as {jerk: own.jerk}", repr(nodes))
-    parts = {name: node if isinstance(node, Mapping) else {"_target_": node} for name, node in nodes.items()}
-    return {
-        str(name): _instantiate({**node, "_partial_": True}, f"study.metrics.{name}") for name, node in parts.items()
-    }
+    made = {}
+    for name, node in nodes.items():
+        whole, field = node if isinstance(node, Mapping) else {"_target_": node}, f"study.metrics.{name}"
+        check_value(whole.get("_target_"), str, field)
+        made[str(name)] = _instantiate({**whole, "_partial_": True}, field)
+    return made
 
 
 def solver_of(configuration: Mapping[str, Any]) -> Any:

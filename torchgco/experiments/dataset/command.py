@@ -30,6 +30,7 @@ from torchgco.experiments.flying.together import cut, fly_all, trial_bar
 from torchgco.experiments.flying.workers import Shared
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import create, damaged, readable, write
+from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive, difference, layout_digests, settings_of
 from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded, source
@@ -98,7 +99,7 @@ def make(folder: Path, words: Sequence[str], left_out: Sequence[LeftOut] = (), l
         raise InputError("scenario", "single vehicles for a data set", f"fleets of {setup.scenario.name}")
     task = tasks.of([0], exact=True)
     check_time(task, {setup.solver_name: setup.solver})
-    check_metrics(setup.metrics, task.problem, task.U0)
+    check_metrics(setup.metrics, COLUMNS, task.problem, task.U0)
     command = [str(folder), *words]
     with held(folder, plan.job, plan.jobs), recorded(folder, setup, plan, command, COMMAND):
         _claim(folder, setup, left_out)

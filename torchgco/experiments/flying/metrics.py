@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from torchgco.base.errors import InputError, shown, theirs
 from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES
 from torchgco.experiments.results.durations import states_of
-from torchgco.experiments.results.folder import COLUMNS
 from torchgco.problem.problem import Problem
 from torchgco.problem.times import times as usual_times
 
@@ -24,15 +23,15 @@ SOMETIMES = (
 )  # fmt: skip
 
 
-def check_metrics(metrics: Metrics, problem: Problem, U: Tensor) -> None:
-    """Check names, and what the metrics return of some controls (B, N, m).
+def check_metrics(metrics: Metrics, columns: Collection[str], problem: Problem, U: Tensor) -> None:
+    """Check names, which may not be those of other columns, and what the metrics return of some controls (B, N, m).
 
     Raises:
         InputError: a name that is no word or another column's, and as `metric_columns` but for NaN: the trajectory of
             a solver may have numbers where that of these controls has none.
     """
     for name in metrics:
-        if not name.isidentifier() or name in (*COLUMNS, *SOMETIMES):
+        if not name.isidentifier() or name in (*columns, *SOMETIMES):
             raise InputError(f"study.metrics.{name}", "a name of its own, of letters, digits and _", "a column's")
     metric_columns(metrics, problem, U, None, None)
 
@@ -64,7 +63,7 @@ def metric_columns(
         for name, metric in metrics.items():
             values = _values(f"study.metrics.{name}", metric, flown)
             if ids is not None and np.isnan(values).any():
-                number = np.asarray(ids)[rows][np.isnan(values)][0]
+                number = np.asarray(ids)[rows.numpy()[np.isnan(values)]][0]
                 raise InputError(f"study.metrics.{name}", "a number of each trajectory", f"NaN on layout {number}")
             columns[name][rows.numpy()] = values
     return columns

@@ -30,7 +30,7 @@ from torchgco.experiments.reports.mission_report import mission_table, write_mis
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.durations import states_of, times_at
-from torchgco.experiments.results.folder import DONE, JUDGED, StudyFolder
+from torchgco.experiments.results.folder import COLUMNS, DONE, JUDGED, StudyFolder
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
@@ -190,7 +190,7 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
         if fleets or setup.mission is not None:
             raise InputError("study.metrics", "null for missions and fleets", ", ".join(setup.metrics))
         first = tasks.of(tasks.groups[0][:2], exact=True)
-        check_metrics(setup.metrics, first.problem, first.U0)
+        check_metrics(setup.metrics, COLUMNS, first.problem, first.U0)
     if (objective := configuration["study"]["objective"]) is not None:
         check_objective(objective, setup.mission is not None)
         if plan.jobs is not None:
