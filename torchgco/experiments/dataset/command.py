@@ -190,5 +190,5 @@ def _run(options: argparse.Namespace) -> int:
     folder = options.folder
     count = make(folder, options.words, options.without, options.license)
     size = sum(path.stat().st_size for path in files_of(folder))
-    say(f"{folder}: {count} layouts, {size / 1e6:.2f} MB")
+    say(f"{folder}: {count} layout{'s' if count != 1 else ''}, {size / 1e6:.2f} MB")
     return 0
