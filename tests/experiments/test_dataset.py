@@ -183,6 +183,21 @@ def test_what_a_data_set_cannot_be_of_is_refused_before_a_folder_is_made(words, 
     assert line in problem_line(capsys.readouterr().err) and not (tmp_path / "data").exists()
 
 
+def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path, capsys) -> None:
+    (tmp_path / "README.md").write_text("mine")
+    assert run(tmp_path, *HOLD, "study.layouts=1") == 2
+    assert "an empty folder" in problem_line(capsys.readouterr().err)
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("README.md", "mine")]
+
+
+def test_an_edited_file_of_layouts_makes_another_data_set(tmp_path: Path, capsys) -> None:
+    words = ["scenario=layouts", f"scenario.path={tmp_path / 'two.npz'}", "model=planar", "solver=hold", ALONE]
+    for shift, code in ((3, 0), (3, 0), (4, 2)):
+        torchgco.Layouts(np.zeros((2, 1, 2)) + shift, np.ones((2, 1)), stages=5).save(tmp_path / "two.npz")
+        assert run(tmp_path / "data", *words) == code
+    assert "which holds another (file is" in capsys.readouterr().err
+
+
 def test_a_file_with_fewer_layouts_is_refused_at_once(tmp_path: Path, capsys) -> None:
     torchgco.Layouts(np.zeros((2, 1, 2)) + 3, np.ones((2, 1))).save(tmp_path / "two.npz")
     words = ["scenario=layouts", f"scenario.path={tmp_path / 'two.npz'}", "model=planar", "solver=hold"]

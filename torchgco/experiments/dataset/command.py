@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,15 +30,22 @@ from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.together import cut, fly_all, trial_bar
 from torchgco.experiments.flying.workers import Shared
 from torchgco.experiments.reports.parser import RunParser
-from torchgco.experiments.results.files import create, damaged, readable, write
+from torchgco.experiments.results.files import checksum, create, damaged, readable, write
 from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive, difference, layout_digests, settings_of
 from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded, source
+from torchgco.scenarios import Task
 from torchgco.scenarios.stored_maps import MAP_ARRAYS, map_arrays
 
 COMMAND = "torchgco-dataset"
 LeftOut = Literal["X", "K", "multipliers"]
+BEFORE = (
+    ".",
+    PART[0],
+    "run.json",
+    "run-",
+)  # how the names of files begin that a start leaves before it claims a folder
 UNKNOWN = "unknown"  # license of a data set whose maker says none
 # Options of a study that have nothing to decide here, with the values that leave them alone.
 UNUSED = {"explain": False, "view": False, "figure": None, "objective": None}
@@ -81,55 +89,69 @@ def make(folder: Path, words: Sequence[str], left_out: Sequence[LeftOut] = (), l
             in which another process works, damaged files.
     """
     check_value(left_out, Sequence[LeftOut], "--without")
-    check_once(words)
-    if others := [word for word in words if word.startswith("study.baselines=")]:
-        raise InputError("study.baselines", "none: a data set is of one solver", others[0])
-    setup = compose([*words, "study.baselines=[]"])
-    plan, study = plan_of(setup), setup.configuration["study"]
-    for name, usual in UNUSED.items():
-        if study[name] != usual:
-            raise InputError(f"study.{name}", f"{usual} for a data set", study[name])
-    if setup.mission is not None:
-        raise InputError("mission", "null for a data set", "a mission")
-    available, count = setup.scenario.available, study["layouts"]
+    setup = _composed(words)
+    plan, available, count = plan_of(setup), setup.scenario.available, setup.configuration["study"]["layouts"]
     count = check_value(available or DEFAULT_LAYOUTS if count is None else count, Count, "study.layouts")
     setup.scenario.draw([count - 1], setup.seed)  # refused where a file has fewer
     tasks, first = Tasks(setup, setup.layouts(1)), setup.scenario.draw(range(min(2, available or 2)), setup.seed)
-    if tasks.layouts.vehicles is not None:
-        raise InputError("scenario", "single vehicles for a data set", f"fleets of {setup.scenario.name}")
-    task = tasks.of([0], exact=True)
-    check_time(task, {setup.solver_name: setup.solver})
-    check_metrics(setup.metrics, COLUMNS, task.problem, task.U0)
+    task = _checked(tasks)
     command = [str(folder), *words]
-    with held(folder, plan.job, plan.jobs), recorded(folder, setup, plan, command, COMMAND):
+    with held(folder, plan.job, plan.jobs):
         _claim(folder, setup, left_out)
         absent: list[str] = list(left_out)
         if first.map is not None and first.count > 1 and first.map.batch is None:  # of all: not in every row
             arrays, absent = map_arrays(first.map), [*left_out, *MAP_ARRAYS]
             create(folder / MAP, lambda file: np.savez_compressed(file, **arrays))  # type: ignore[arg-type]
-        left = plan.share(_missing(folder, count, plan.repair).tolist(), count)
-        _fly(folder, tasks, plan, left, absent, len(plan.share(range(count), count)))
-        made = {**source(), "command": shlex.join([COMMAND, *command])}
-        write_card(folder, setup, task.problem, count, made, license)
+        with recorded(folder, setup, plan, command, COMMAND):
+            left = plan.share(_missing(folder, count, plan.repair).tolist(), count)
+            _fly(folder, tasks, plan, left, absent, len(plan.share(range(count), count)))
+            made = {**source(), "command": shlex.join([COMMAND, *command])}
+            write_card(folder, setup, task.problem, count, made, license)
         for path in folder.glob(f"{PART[0]}*{PART[1]}") if plan.job is None else ():  # of a start that was killed
             path.unlink(missing_ok=True)
     return count - len(_missing(folder, count, False))
 
 
+def _composed(words: Sequence[str]) -> Setup:
+    """The configuration of a data set."""
+    check_once(words)
+    if others := [word for word in words if word.startswith("study.baselines=")]:
+        raise InputError("study.baselines", "none: a data set is of one solver", others[0])
+    setup = compose([*words, "study.baselines=[]"])
+    for name, usual in UNUSED.items():
+        if (value := setup.configuration["study"][name]) != usual:
+            raise InputError(f"study.{name}", f"{usual} for a data set", value)
+    if setup.mission is not None:
+        raise InputError("mission", "null for a data set", "a mission")
+    return setup
+
+
+def _checked(tasks: Tasks) -> Task:
+    """The problem of the first layout, with which solver and metrics can do something."""
+    if tasks.layouts.vehicles is not None:
+        raise InputError("scenario", "single vehicles for a data set", f"fleets of {tasks.setup.scenario.name}")
+    task = tasks.of([0], exact=True)
+    check_time(task, {tasks.setup.solver_name: tasks.setup.solver})
+    check_metrics(tasks.setup.metrics, COLUMNS, task.problem, task.U0)
+    return task
+
+
 def _claim(folder: Path, setup: Setup, left_out: Sequence[str]) -> None:
-    """Make the folder that of this data set; InputError where it is another's."""
-    solver = {setup.solver_name: settings_of(setup.configuration)}
-    about = {"version": VERSION, "seed": setup.seed, "left_out": sorted(left_out)}
-    about |= decisive(setup.configuration, solver)
+    """Make the folder that of this data set; InputError where it is another's, or holds other files."""
+    configuration, solver = setup.configuration, {setup.solver_name: settings_of(setup.configuration)}
+    about = {"version": VERSION, "seed": setup.seed, "left_out": sorted(left_out)} | decisive(configuration, solver)
+    if os.path.isfile(path := configuration["scenario"].get("path") or ""):
+        about["file"] = checksum(Path(path))  # it may be edited between two starts
     text = json.dumps(about, indent=1, default=str).encode()
-    if not (folder / ABOUT).is_file() and files_of(folder):
-        raise damaged(folder / ABOUT, "is missing")
-    if create(folder / ABOUT, lambda file: file.write(text)):
+    expected, there = "an empty folder, or one of this very data set", folder / ABOUT
+    others = [path.name for path in folder.iterdir() if not path.name.startswith(BEFORE)]
+    if others and not there.is_file():
+        raise damaged(there, "is missing") if files_of(folder) else InputError("FOLDER", expected, f"{others[0]} in it")
+    if create(there, lambda file: file.write(text)):
         return
-    stored, new = readable(folder / ABOUT, lambda path: json.loads(regular(path).read_bytes())), json.loads(text)
+    stored, new = readable(there, lambda path: json.loads(regular(path).read_bytes())), json.loads(text)
     if stored != new:
-        got = f"{folder}, which holds another ({difference(stored, new)})"
-        raise InputError("FOLDER", "an empty folder, or one of this very data set", got)
+        raise InputError("FOLDER", expected, f"{folder}, which holds another ({difference(stored, new)})")
 
 
 def _missing(folder: Path, count: int, repair: bool) -> np.ndarray:
