@@ -30,7 +30,7 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=FOLDER, help="elsewhere the reference alone is made")
     output = parser.parse_args(words).output
-    for name in ("compose", "read"):  # imported lazily: pdoc looks for them in the module
+    for name in ("compose", "read", "read_dataset"):  # imported lazily: pdoc looks for them in the module
         vars(torchgco)[name] = getattr(torchgco, name)
     for page in pdoc.extract.walk_specs(PAGES):
         pdoc.extract.load_module(page)

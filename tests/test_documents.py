@@ -32,6 +32,7 @@ from tests.slow import mostly
 from torchgco import Problem, presets
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
+from torchgco.experiments.dataset import command as dataset
 from torchgco.experiments.referee import judge
 from torchgco.experiments.reports import export, identify, report, view
 from torchgco.experiments.reports.parser import RunParser
@@ -93,7 +94,7 @@ def name_of(page: Path) -> str:
 
 REPORTS: dict[str, Callable[[list[str]], Any]] = {
     f"torchgco-{module.__name__.rpartition('.')[2]}": module.main for module in (report, view, export, identify, judge)
-}
+} | {"torchgco-dataset": dataset.main}
 
 
 def accept(command: str) -> None:
@@ -105,7 +106,7 @@ def accept(command: str) -> None:
         accept_overrides([word for word in words if word not in ("--help", "--version")])
     elif program in REPORTS:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(RunParser, "run", lambda parser, arguments, work: parser.parse_args(arguments))
+            patch.setattr(RunParser, "run", lambda parser, arguments, work: parser.parse_intermixed_args(arguments))
             options = REPORTS[program](words)
         assert program != "torchgco-report" or options.folders or options.power
         accept_overrides(getattr(options, "words", []))
@@ -335,7 +336,7 @@ def test_every_public_name_exists() -> None:
     assert len(set(torchgco.__all__)) == len(torchgco.__all__)
     held = vars(torchgco).items()
     public = {name for name, value in held if getattr(value, "__module__", "").startswith("torchgco.")}
-    assert public | {"compose", "presets", "read"} == set(torchgco.__all__)
+    assert public | {"compose", "presets", "read", "read_dataset"} == set(torchgco.__all__)
     for name in torchgco.__all__:
         assert getattr(torchgco, name) is not None
 

@@ -9,8 +9,8 @@ where it can't serve. `solvers` holds the local solvers: AL-iLQR (with the `lagr
 obstacles catch a trajectory, `search` runs the table of passes that `presets.gco` lists, along paths from the
 `roadmap` and from samples of the `guidance`, and keeps the best. `judging` measures the result by code of its own.
 
-`torchgco.compose` needs Hydra, `torchgco.read` pandas, and both are imported lazily: importing torchgco loads neither
-Hydra nor matplotlib.
+`torchgco.compose` needs Hydra, `torchgco.read` and `read_dataset` pandas, and all are imported lazily: importing
+torchgco loads neither Hydra nor matplotlib.
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ from torchgco.tightened import tightened
 if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage as HtmlPage
     from torchgco.experiments.config.build import compose as compose
+    from torchgco.experiments.dataset.rows import read_dataset as read_dataset
     from torchgco.experiments.results.merge import read as read
 
 # In the order of the API reference.
@@ -109,7 +110,7 @@ __all__ = [  # noqa: RUF022
     # checking the result
     "judge", "certify", "Certificate",
     # layouts, configurations, studies, errors
-    "Layouts", "compose", "read", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
+    "Layouts", "compose", "read", "read_dataset", "InputError", "GuidanceWarning", "ContactWarning", "HorizonWarning",
     "RefusalWarning", "ScaleWarning", "StartWarning", "StepWarning", "TraceWarning",
     "DeviceWarning",
 ]  # fmt: skip
@@ -143,4 +144,8 @@ def __getattr__(name: str) -> Any:
         from torchgco.experiments.results.merge import read
 
         return read
+    if name == "read_dataset":
+        from torchgco.experiments.dataset.rows import read_dataset
+
+        return read_dataset
     raise AttributeError(f"module 'torchgco' has no attribute {name!r}")

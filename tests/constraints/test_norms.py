@@ -257,7 +257,7 @@ def test_explained_by_side_and_components() -> None:
 
 WRONG: dict[str, list[Any]] = {
     "norm_bounds.of": [NormBounds(of, 0.1) for of in ("v", None, ("x", [10]), ("u", [0, 0]), ("u", []), ("x", 1.5),
-        ("q", [0]), ("x", [True]), ("x", [-1]), ["x", [1]], ("u", slice(3, 9)))],
+        ("q", [0]), ("x", [True]), ("x", [-1]), ["x", [10]], ["x"], ("u", slice(3, 9)))],
     "norm_bounds.lower": [NormBounds("u", lower, 1.0) for lower in (-0.1, 1.0, 2.0, torch.inf, "a", [0.1, 0.2],
         torch.nan, [[0.1] * 7])],
     "norm_bounds.upper": [NormBounds("u", 0.0, upper) for upper in (0.0, -1.0, torch.nan, EACH.float())],

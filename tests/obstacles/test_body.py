@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import torchgco
 from tests.problems import planar_batch, quadrotor_batch, random_trajectory
 from torchgco import (
     Body,
@@ -30,10 +32,11 @@ from torchgco import (
     Spheres,
     Unicycle,
 )
+from torchgco.kernels import use_native
 from torchgco.maps import PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.silhouettes import balls_at
+from torchgco.plotting.silhouettes import balls_at, silhouettes
 from torchgco.plotting.world import world_of
 from torchgco.problem.horizons import for_solvers
 from torchgco.roadmap.scene import scene_of
@@ -244,7 +247,8 @@ def test_bad_bodies_are_told() -> None:
         (lambda: Body([[0.0, np.nan]], 0.1), "body.offsets: expected finite numbers"),
         (lambda: Body([[0.0, 0.0]], [0.1, 0.2]), "body.radii: expected shape (1)"),
         (lambda: Body([[0.0, 0.0]], -0.1), "body.radii: expected finite radii"),
-        (lambda: Body([[0.0, 0.0]], 0.1, "yaw"), "body.attitude: expected 'heading', 'quaternion', or a function"),
+        (lambda: Body([[0.0, 0.0]], 0.1, 3), "body.attitude: expected 'heading', 'quaternion', names of angles"),
+        (lambda: problem_of(2, kinds(2)["map"], Body([[0.1, 0.0]], 0.1, "yaw")), "a model with states named yaw"),
         (lambda: Body.covering([0, 0], [1, 0], [2, 2]), "body.upper"),
         (lambda: Body.covering([0, 0], [1, 1], [2, 0]), "body.cells"),
         (lambda: Body([[0.0, 0.0]], 0.1, box=[[0, 0]]), "body.box: expected two corners"),
@@ -306,3 +310,106 @@ def test_pictures_show_the_balls() -> None:
     assert world.first.margin == 0.0 and radii.tolist() == ROD.radii.tolist() and centers.shape == (9, 3, 2)
     x = X[1, 4].numpy()
     np.testing.assert_allclose(centers[4, 2], x[:2] + turned(2, x) @ ROD.offsets[2].numpy(), atol=1e-12)
+
+
+# A car, a trailer behind its axle, and an arm of two links on the trailer, whose second joint's angle is relative.
+ARM = Body([[0.2, 0.0]], 0.08, ("swing", "elbow"), hinge=[0.3, 0.0])
+BOOM = Body([[0.15, 0.0]], 0.05, "swing", parts=[ARM], hinge=[-0.4, 0.1])
+TRAILER = Body([[-0.3, 0.0]], 0.1, "trailer", hinge=[-0.3, 0.0])
+TRUCK = Body([[0.2, 0.0], [-0.2, 0.0]], [0.15, 0.12], "yaw", parts=[TRAILER, BOOM])
+TURNED = ("x", "y", "yaw", "trailer", "swing", "elbow")
+
+
+def jointed(make: Callable[[Any], Any], body: Body = TRUCK, dt: float = 0.1) -> Problem:
+    """A point whose angles are turned by controls of their own, among obstacles."""
+    model = FunctionDynamics(lambda x, u: x + dt * u, 6, 6, dt, position=slice(0, 2), state_names=TURNED)
+    starts = torch.tensor(np.random.default_rng(4).normal(0, 0.3, (B, 6)) - np.eye(6)[0] * 0.8)
+    return Problem(model, QuadraticCost([1.0] * 6, [0.1] * 6, [1.0] * 6), [make(body)], starts, 8)
+
+
+def by_hand(x: np.ndarray) -> np.ndarray:
+    """Where the five balls of TRUCK are, by the textbook."""
+
+    def along(angle: float, x: float, y: float = 0.0) -> np.ndarray:
+        return np.array([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
+
+    p, yaw, trailer, swing, elbow = x[:2], *x[2:]
+    post = p + along(yaw, -0.4, 0.1)
+    tip = post + along(swing, 0.3) + along(swing + elbow, 0.2)
+    axle = p + along(yaw, -0.3) + along(trailer, -0.3)
+    return np.stack((p + along(yaw, 0.2), p + along(yaw, -0.2), axle, post + along(swing, 0.15), tip))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parts_are_where_their_hinges_and_angles_put_them(kind: str) -> None:
+    problem = jointed(kinds(2)[kind])
+    (part,), X = problem.constraints, torch.tensor(np.random.default_rng(5).normal(0, 1, (B, 9, 6)))
+    U = torch.zeros(B, 8, 6, dtype=D)
+    centers = np.array([[by_hand(x) for x in one] for one in X.numpy()])
+    np.testing.assert_allclose(part.points.at(X).numpy(), centers, atol=1e-12)
+    np.testing.assert_allclose(part.radii[0].numpy(), [0.15, 0.12, 0.1, 0.05, 0.08])
+    away = np.linalg.norm(centers - X[:, :, None, :2].numpy(), axis=-1) + part.radii[0].numpy()
+    assert away.max() <= float(part.reach[0]) <= TRUCK.reach + 1e-9 < 1.1
+    c, g = part.value(X, U), torch.rand(B, 8, part.value(X, U).shape[-1], dtype=D)
+    H = torch.zeros(B, 9, 13, 13, dtype=D)
+    part.accumulate(X, U, g, torch.zeros_like(g), H)
+    leaf = X.clone().requires_grad_()
+    (slope,) = torch.autograd.grad((part.value(leaf, U) * g).sum(), leaf)
+    torch.testing.assert_close(H[..., 6, :6], slope, atol=1e-10, rtol=1e-9)
+    torch.testing.assert_close(part.take(torch.tensor([2, 0])).value(X[[2, 0]], U[[2, 0]]), c[[2, 0]])
+    if not part.moving:  # a lower bound of what fine states between the knots say
+        fine = torch.cat([torch.lerp(X[:, :-1], X[:, 1:], s) for s in torch.linspace(0, 1, 21).tolist()], dim=1)
+        assert bool((part.clearances(X)[1] <= part.clearances(fine)[0] + 1e-9).all())
+
+
+def test_between_knots_no_part_leaves_its_chord_further_than_the_bulge() -> None:
+    points, rng = jointed(kinds(2)["spheres"]).constraints[0].points, np.random.default_rng(6)
+    for size in (0.1, 1.0, 2.5):
+        X = torch.tensor(rng.normal(0, size, (B, 2, 6)))
+        X[..., :2] = X[:, :1, :2]  # the position's own chord is straight
+        ends, bulge = points.at(X), points.bulge(X)[:, 0]
+        for share in np.linspace(0, 1, 33):
+            p = points.at(torch.lerp(X[:, :1], X[:, 1:], float(share)))[:, 0]
+            chord = ends[:, 1] - ends[:, 0]
+            along = (((p - ends[:, 0]) * chord).sum(-1) / chord.square().sum(-1)).clamp(0, 1)
+            away = (p - ends[:, 0] - along.unsqueeze(-1) * chord).norm(dim=-1)
+            assert bool((away <= bulge + 1e-9).all())
+
+
+def test_c_solves_bodies_with_parts_as_pytorch_does() -> None:
+    problem = jointed(lambda body: Spheres([[-0.2, 0.5]], [0.15], body))
+    found = torchgco.solve(problem, solver="al_ilqr")
+    use_native(False)
+    try:
+        plain = torchgco.solve(problem, solver="al_ilqr")
+    finally:
+        use_native(True)
+    torch.testing.assert_close(found.cost, plain.cost, rtol=1e-6, atol=1e-9)
+    assert found.account is not None and found.account.kernels == "native"
+
+
+def test_pictures_show_the_parts() -> None:
+    world = world_of(jointed(kinds(2)["spheres"]), 0)
+    assert world.body is not None and world.body.fixed == 2
+    states = np.random.default_rng(7).normal(0, 1, (3, 6))
+    rings = silhouettes(world.body, states, (0, 1))
+    middles = [ring.mean(0) for ring in rings]
+    np.testing.assert_allclose(middles, np.concatenate([by_hand(x) for x in states]), atol=0.02)
+    box = Body.covering([-0.3, -0.2], [0.3, 0.2], [2, 1], "yaw")
+    covered = replace(box, parts=TRUCK.parts)
+    outlines = silhouettes(jointed(kinds(2)["spheres"], covered).constraints[0], states, (0, 1))
+    assert len(outlines) == 3 + 3 * 3
+
+
+@pytest.mark.parametrize("make, line", [
+    (lambda: Body([[0.0, 0.0]], 0.1, ()), "body.attitude: expected"),
+    (lambda: Body([[0.0, 0.0]], 0.1, hinge=[1.0]), "body.hinge: expected"),
+    (lambda: Body([[0.0, 0.0]], 0.1, hinge=[1.0, np.nan]), "body.hinge: expected finite"),
+    (lambda: Body([[0.0, 0.0]], 0.1, parts=[3]), "body.parts: expected"),
+    (lambda: jointed(kinds(2)["map"], Body([[0.0, 0.0]], 0.1, "yaw", parts=[FRAME])), "body.parts: expected 2-D parts"),
+    (lambda: jointed(kinds(2)["map"], Body([[0.0, 0.0]], 0.1, "yaw", parts=[ROD])), "states named heading"),
+])  # fmt: skip
+def test_parts_that_do_not_fit_are_refused_in_a_line(make: Callable[[], Any], line: str) -> None:
+    with pytest.raises(InputError) as raised:
+        make()
+    assert line in str(raised.value) and "\n" not in str(raised.value)

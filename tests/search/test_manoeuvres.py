@@ -58,6 +58,8 @@ def test_a_car_is_known_by_its_equations_and_its_body() -> None:
     found = car(problem)
     assert found is not None and (found.heading, found.speed, found.radius) == (2, 3, 0.4)
     assert found.curvature == pytest.approx(TIGHT, rel=1e-12)
+    trailing = Body([[0.0, 0.0]], 0.4, parts=[Body([[-0.5, 0.0]], 0.3, "steering")])
+    assert car(corridor([[0.0, 1.2, 0.1]], trailing)) is None  # a pose doesn't say where the part is
     assert car(corridor([[0.0, 1.2, 0.1]], vehicle=0.4)) is None
     turns = car(corridor([[0.0, 1.2, 0.1]], dynamics=Unicycle(0.1)))
     assert turns is not None and turns.on_the_spot and not found.on_the_spot

@@ -334,7 +334,7 @@ def _chosen(
     of: Any, known: Tensor | None, kinds: tuple[str, ...], dims: Dimensions, field: str
 ) -> tuple[Literal["x", "u", "quaternion"], Tensor]:
     """Whose components, and which (c,) int64; `known` are those of a constraint that is bound already."""
-    pair = of if isinstance(of, tuple) and len(of) == 2 else (of, slice(None) if known is None else known)
+    pair = of if isinstance(of, tuple | list) and len(of) == 2 else (of, slice(None) if known is None else known)
     kind, which = pair
     if not isinstance(kind, str) or kind not in kinds:
         words = ", ".join(f'"{word}"' for word in kinds)

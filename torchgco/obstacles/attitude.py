@@ -1,9 +1,11 @@
-"""How a vehicle's frame is turned in its states: by a heading, a quaternion, or a function of a user."""
+"""How a vehicle's frame is turned in its states: by angles, a quaternion, or a function of a user."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES, Dimensions
 
 QUATERNION = "qw", "qx", "qy", "qz"
+BALL_RAYS = 720  # along which the largest ball that a body holds is measured
 ROTATION_WITHIN = 1e-6  # how far a rotation's product with its transpose may be from the identity
 
 
@@ -22,27 +25,36 @@ class Attitude:
     """Rotation matrices (..., d, d) of states (..., n).
 
     Args:
-        of: the function, or the place of the heading, or of the quaternion's first component.
+        of: the function; or in the plane the place of the angle, or of those whose sum it is; or the place of the
+            quaternion's first component.
         d: dimension of space.
     """
 
-    of: Callable[[Tensor], Tensor] | int
+    of: Callable[[Tensor], Tensor] | int | tuple[int, ...]
     d: int
 
     @property
     def calls_function(self) -> bool:
         """Whether it is a user's function."""
-        return not isinstance(self.of, int)
+        return not isinstance(self.of, int | tuple)
 
     def __call__(self, x: Tensor) -> Tensor:
-        if not isinstance(self.of, int):
+        if callable(self.of):
             return self.of(x)
-        return in_plane(x[..., self.of]) if self.d == 2 else in_space(x[..., self.of : self.of + 4])
+        if isinstance(self.of, int) and self.d == 3:
+            return in_space(x[..., self.of : self.of + 4])
+        return in_plane(self._angle(x))
+
+    def _angle(self, x: Tensor) -> Tensor:
+        """The angle (...), rad, in the plane."""
+        places = (self.of,) if isinstance(self.of, int) else self.of
+        assert isinstance(places, tuple)
+        return sum((x[..., i] for i in places[1:]), x[..., places[0]])
 
     def turns(self, X: Tensor) -> Tensor:
         """Angles (B, N), rad, by which the vehicle turns from each state of X (B, N+1, n) to the next."""
-        if isinstance(self.of, int) and self.d == 2:
-            return X[..., self.of].diff(dim=1).abs()
+        if not callable(self.of) and self.d == 2:
+            return self._angle(X).diff(dim=1).abs()
         R = self(X)
         trace = (R[:, 1:] * R[:, :-1]).sum((-1, -2))  # 2 cos of the turn in the plane, 1 + 2 cos in space
         return (0.5 * (trace - (self.d - 2))).clamp(-1.0, 1.0).acos()
@@ -66,6 +78,17 @@ def in_space(quaternion: Tensor) -> Tensor:
     return torch.stack([torch.stack([entry / square for entry in row], dim=-1) for row in rows], dim=-2)
 
 
+def directions(d: int) -> Tensor:
+    """Unit vectors (R, d) all around, in space a Fibonacci lattice."""
+    i = torch.arange(BALL_RAYS, dtype=torch.float64, device="cpu")
+    if d == 2:
+        angle = 2.0 * math.pi / BALL_RAYS * i
+        return torch.stack((angle.cos(), angle.sin()), dim=-1)
+    z, angle = 1.0 - (2.0 * i + 1.0) / BALL_RAYS, math.pi * (3.0 - math.sqrt(5.0)) * i
+    flat = (1.0 - z.square()).sqrt()
+    return torch.stack((flat * angle.cos(), flat * angle.sin(), z), dim=-1)
+
+
 def rotation(q: np.ndarray) -> np.ndarray:
     """The matrix (3, 3) of a unit quaternion [w, x, y, z], from the body's axes to the world's."""
     w, x, y, z = q
@@ -76,24 +99,15 @@ def rotation(q: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-def attitude_of(attitude: str | Callable[[Tensor], Tensor], d: int, dims: Dimensions) -> Attitude:
+def attitude_of(attitude: Any, d: int, dims: Dimensions) -> Attitude:
     """The attitude that a body names, in the states of a problem's model.
 
     Raises:
         InputError: the model has no such state, space has another dimension, or the function returns something else
             than rotation matrices of the problem's starts.
     """
-    if isinstance(attitude, str):
-        names, wanted = list(dims.state_names), ("heading",) if attitude == "heading" else QUATERNION
-        if d != (2 if attitude == "heading" else 3):
-            expected = "'quaternion', or a function, in space" if d == 3 else "'heading', or a function, in the plane"
-            raise InputError("body.attitude", expected, f"{attitude!r}")
-        first = names.index(wanted[0]) if wanted[0] in names else 0
-        if tuple(names[first : first + len(wanted)]) != wanted:
-            expected = f"a model with states named {', '.join(wanted)}, or a function of the state"
-            got = f"{attitude!r} for states {', '.join(names) if names else 'without names'}"
-            raise InputError("body.attitude", expected, got)
-        return Attitude(first, d)
+    if isinstance(attitude, str | Sequence):
+        return _named(attitude, d, list(dims.state_names))
     try:
         R = attitude(dims.like)
     except MISTAKES as error:
@@ -109,3 +123,18 @@ def attitude_of(attitude: str | Callable[[Tensor], Tensor], d: int, dims: Dimens
         got = f"matrices that differ from them by {float(away[finite].max()):.3g}"
         raise InputError("body.attitude", "rotation matrices R, with R R' = 1", got)
     return Attitude(attitude, d)
+
+
+def _named(attitude: str | Sequence[str], d: int, names: list[str]) -> Attitude:
+    """The attitude of states with these names, among those of a model."""
+    spatial = attitude == "quaternion"
+    wanted = QUATERNION if spatial else (attitude,) if isinstance(attitude, str) else tuple(attitude)
+    if d != (3 if spatial else 2):
+        expected = "'quaternion', or a function, in space" if d == 3 else "'heading', or a function, in the plane"
+        raise InputError("body.attitude", expected, f"{attitude!r}")
+    places = tuple(names.index(name) for name in wanted if name in names)
+    if len(places) < len(wanted) or (spatial and places != tuple(range(places[0], places[0] + 4))):
+        expected = f"a model with states named {', '.join(wanted)}, or a function of the state"
+        got = f"{attitude!r} for states {', '.join(names) if names else 'without names'}"
+        raise InputError("body.attitude", expected, got)
+    return Attitude(places[0] if spatial or len(places) == 1 else places, d)

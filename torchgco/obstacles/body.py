@@ -13,18 +13,19 @@ from torch import Tensor
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number
+from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions, check_finite, check_shape, space_of, tensor
 from torchgco.base.tree import PerElement, passed_on
 from torchgco.constraints.base import CONTACT_FACTOR, Lowered
-from torchgco.obstacles.attitude import Attitude, attitude_of
+from torchgco.obstacles.attitude import Attitude, attitude_of, directions
 from torchgco.obstacles.base import Obstacles, Solids, places_of
 from torchgco.obstacles.measured import Distances
 
 if TYPE_CHECKING:
     from torchgco.constraints.base import Constraint
 
-BALL_RAYS = 720  # along which the largest ball that a body holds is measured, and ...
-COUNTED_SHARE = 0.97  # ... the share of it that counts: between two rays the body may be thinner
+Chain = tuple[tuple[Attitude, Tensor], ...]
+COUNTED_SHARE = 0.97  # of the largest ball along BALL_RAYS that a body holds: between two rays it may be thinner
 PIECES = 4  # of a step, between which the balls move on straight lines
 
 
@@ -42,10 +43,14 @@ class Body:
     Args:
         offsets: (P, d), the balls' centers in the vehicle's frame, from its position, m.
         radii: number or (P,), m, at least 0.
-        attitude: what turns the vehicle's frame into that of space. "heading": the model's state of this name, in the
-            plane; "quaternion": the model's states qw, qx, qy, qz, in space, divided by their norm; or a function of
-            states (..., n) that returns rotation matrices (..., d, d).
+        attitude: what turns the vehicle's frame into that of space. In the plane an angle: the model's state of this
+            name, rad, or of several the sum, as of joints that follow each other; "quaternion": the model's states qw,
+            qx, qy, qz, in space, divided by their norm; or a function of states (..., n) that returns rotation
+            matrices (..., d, d).
         box: corners (lower, upper), (d,) each, of a box that the balls cover, m, which pictures show in their place.
+        parts: further bodies that hang on this one, such as a trailer or the links of an arm, each with an attitude of
+            its own, by which it turns around its hinge.
+        hinge: of a part, (d,): where its own frame begins in the frame of what it hangs on, m; None: where that does.
 
     Raises:
         InputError: offsets or radii that aren't finite numbers of these shapes, no ball, a negative radius, another
@@ -55,8 +60,10 @@ class Body:
 
     offsets: Any
     radii: Any
-    attitude: str | Callable[[Tensor], Tensor] = "heading"
+    attitude: str | Sequence[str] | Callable[[Tensor], Tensor] = "heading"
     box: Any = None
+    parts: Sequence[Body] = ()
+    hinge: Any = None
 
     def __post_init__(self) -> None:
         offsets = numbers(self.offsets, "body.offsets")
@@ -69,9 +76,18 @@ class Body:
         check_finite(offsets, "body.offsets")
         if not bool(((radii >= 0) & torch.isfinite(radii)).all()):
             raise InputError("body.radii", "finite radii of at least 0 m", radii.tolist())
-        if self.attitude not in ("heading", "quaternion") and not callable(self.attitude):
-            expected = "'heading', 'quaternion', or a function of states that returns rotation matrices"
+        names = (self.attitude,) if isinstance(self.attitude, str) or callable(self.attitude) else self.attitude
+        texts = isinstance(names, Sequence) and len(names) > 0 and all(isinstance(name, str) for name in names)
+        if not texts and not callable(self.attitude):
+            expected = (
+                "'heading', 'quaternion', names of angles, or a function of states that returns rotation matrices"
+            )
             raise InputError("body.attitude", expected, shown(self.attitude))
+        check_value(self.parts, Sequence[Body], "body.parts")
+        hinge = torch.zeros_like(offsets[0]) if self.hinge is None else numbers(self.hinge, "body.hinge")
+        check_shape(hinge, (offsets.shape[1],), "body.hinge")
+        check_finite(hinge, "body.hinge")
+        object.__setattr__(self, "hinge", hinge)
         if self.box is not None:
             object.__setattr__(self, "box", _corners(self.box, offsets.shape[1]))
         object.__setattr__(self, "offsets", offsets.clone())
@@ -110,6 +126,12 @@ class Body:
         alone = float((self.radii - self.offsets.norm(dim=-1)).max())
         return max(0.0, alone, COUNTED_SHARE * float(self._way_out(directions(self.offsets.shape[1])).min()))
 
+    @property
+    def reach(self) -> float:
+        """The radius of a ball about the position that holds the body, m, without parts the smallest."""
+        hung = [float(part.hinge.norm()) + part.reach for part in self.parts]
+        return max(float((self.radii + self.offsets.norm(dim=-1)).max()), *hung, 0.0)
+
     def _way_out(self, along: Tensor) -> Tensor:
         """How far rays from the position along unit vectors (R, d) stay in the body, (R,), m."""
         middle = along @ self.offsets.mT  # (R, P)
@@ -122,27 +144,42 @@ class Body:
             reached = torch.maximum(reached, further)
         return reached
 
-    @property
-    def reach(self) -> float:
-        """The radius of the smallest ball about the position that holds the body, m."""
-        return float((self.radii + self.offsets.norm(dim=-1)).max())
-
     def around(self, obstacles: Any, dims: Dimensions) -> Constraint:
         """Obstacles (`Spheres`, ...) that have this body as their `vehicle_radius`, bound to a problem."""
         d = space_of(dims, "body.offsets")
         if self.offsets.shape[1] != d:
             got = f"{self.offsets.shape[1]}-D"
             raise InputError("body.offsets", f"{d}-D offsets, as the vehicle's position is {d}-D", got)
-        if len(self.offsets) == 1 and not bool(self.offsets.any()):
+        if len(self.offsets) == 1 and not bool(self.offsets.any()) and not self.parts:
             return of_ball(obstacles, float(self.radii[0]), dims)
-        attitude = attitude_of(self.attitude, d, dims)
-        offsets = self.offsets.to(dims.like).expand(dims.B, -1, -1).contiguous()
+        attitude, chains = attitude_of(self.attitude, d, dims), self._chains(d, dims)
+        frames = list(dict.fromkeys([attitude, *(frame for _, chain in chains for frame, _ in chain)]))
+        arms = torch.zeros(len(frames), len(chains), d, dtype=torch.float64, device="cpu")
+        for i, (_, chain) in enumerate(chains):
+            for frame, arm in chain:
+                arms[frames.index(frame), i] += arm
+        offsets, *more = (arm.to(dims.like).expand(dims.B, -1, -1).contiguous() for arm in arms)
         assert dims.position is not None  # as space has d dimensions
         inner = of_ball(obstacles, self.inscribed_radius, dims)
-        points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots)
+        points = BodyPoints(offsets, attitude, dims.n, dims.position, inner.knots, tuple(more), tuple(frames[1:]))
         ball_dims = replace(dims, n=d, position=slice(0, d))
-        balls = tuple(of_ball(obstacles, float(radius), ball_dims) for radius in self.radii)
-        return BoundBody(balls, inner, points, self.box)
+        balls = tuple(of_ball(obstacles, radius, ball_dims) for radius, _ in chains)
+        return BoundBody(balls, inner, points, self.box, len(self.offsets))
+
+    def _chains(self, d: int, dims: Dimensions, before: Chain = ()) -> list[tuple[float, Chain]]:
+        """Each ball's radius, and the arms (d,) that lead to its center, each with the attitude that turns it.
+
+        Args:
+            before: the arms to where this body's frame begins.
+        """
+        if self.offsets.shape[1] != d:
+            raise InputError("body.parts", f"{d}-D parts", f"{self.offsets.shape[1]}-D")
+        frame = attitude_of(self.attitude, d, dims)
+        balls = zip(self.offsets, self.radii.tolist(), strict=True)
+        chains: list[tuple[float, Chain]] = [(radius, (*before, (frame, offset))) for offset, radius in balls]
+        for part in self.parts:
+            chains += part._chains(d, dims, (*before, (frame, part.hinge)))
+        return chains
 
 
 def numbers(value: Any, field: str) -> Tensor:
@@ -163,17 +200,6 @@ def _corners(box: Any, d: int) -> tuple[tuple[float, ...], ...]:
     return tuple(low.tolist()), tuple(high.tolist())
 
 
-def directions(d: int) -> Tensor:
-    """Unit vectors (R, d) all around, in space a Fibonacci lattice."""
-    i = torch.arange(BALL_RAYS, dtype=torch.float64, device="cpu")
-    if d == 2:
-        angle = 2.0 * math.pi / BALL_RAYS * i
-        return torch.stack((angle.cos(), angle.sin()), dim=-1)
-    z, angle = 1.0 - (2.0 * i + 1.0) / BALL_RAYS, math.pi * (3.0 - math.sqrt(5.0)) * i
-    flat = (1.0 - z.square()).sqrt()
-    return torch.stack((flat * angle.cos(), flat * angle.sin(), z), dim=-1)
-
-
 def check_no_body(problem: Any, field: str, expected: str) -> None:
     """Raise InputError naming `field` where a problem's vehicle is a body of several balls."""
     if any(obstacles.body for obstacles in problem.obstacles):
@@ -192,20 +218,29 @@ def of_ball(obstacles: Any, radius: float, dims: Dimensions) -> Any:
 class BodyPoints(PerElement):
     """The centers of a body's balls as functions of the state."""
 
-    offsets: Tensor  # (B, P, d), m
+    offsets: Tensor  # (B, P, d), m, in the vehicle's frame
     attitude: Attitude
     n: int  # states of the model, with which those of a form of the problem begin
     position: slice
     knots: Any
+    arms: tuple[Tensor, ...] = ()  # likewise in the frames of further parts, which add up
+    frames: tuple[Attitude, ...] = ()
 
-    batched: ClassVar[tuple[str, ...]] = ("offsets",)
+    batched: ClassVar[tuple[str, ...]] = ("offsets", "arms")
+
+    @property
+    def lengths(self) -> Tensor:
+        """How far centers get from the position, at most, (B, P), m."""
+        return sum((arm.norm(dim=-1) for arm in self.arms), self.offsets.norm(dim=-1))
 
     def at(self, x: Tensor) -> Tensor:
         """Centers (B, ..., P, d) of states (B, ..., n)."""
         x = x[..., : self.n]
-        R = self.attitude(x)
-        offsets = self.offsets.view(len(self.offsets), *([1] * (x.dim() - 2)), *self.offsets.shape[1:])
-        return x[..., None, self.position] + (R.unsqueeze(-3) * offsets.unsqueeze(-2)).sum(-1)
+        centers = x[..., None, self.position]
+        for attitude, offsets in zip((self.attitude, *self.frames), (self.offsets, *self.arms), strict=True):
+            aligned = offsets.view(len(offsets), *([1] * (x.dim() - 2)), *offsets.shape[1:])
+            centers = centers + (attitude(x).unsqueeze(-3) * aligned.unsqueeze(-2)).sum(-1)
+        return centers
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         """The same at the knots, (B, K, P d), for X (B, N+1, n), as rows of a constraint."""
@@ -217,10 +252,13 @@ class BodyPoints(PerElement):
         return slopes.unflatten(-2, (self.offsets.shape[1], self.offsets.shape[2]))
 
     def bulge(self, X: Tensor) -> Tensor:
-        """How far centers leave their chords where the vehicle turns evenly from each state of X (B, N+1, n) to the
-        next, and its position moves straight: |offset| (1 - cos(half the turn)), (B, N, P), m."""
-        half = (0.5 * self.attitude.turns(X[..., : self.n])).clamp(max=math.pi)
-        return (1.0 - half.cos()).unsqueeze(-1) * self.offsets.norm(dim=-1).unsqueeze(1)
+        """How far centers leave their chords where all frames turn evenly from each state of X (B, N+1, n) to the next,
+        and the position moves straight: the sum of |arm| (1 - cos(half the turn)), (B, N, P), m."""
+        bulge = torch.zeros_like(X[:, 1:, :1])
+        for attitude, offsets in zip((self.attitude, *self.frames), (self.offsets, *self.arms), strict=True):
+            half = (0.5 * attitude.turns(X[..., : self.n])).clamp(max=math.pi)
+            bulge = bulge + (1.0 - half.cos()).unsqueeze(-1) * offsets.norm(dim=-1).unsqueeze(1)
+        return bulge
 
 
 @dataclass(frozen=True)
@@ -231,6 +269,7 @@ class BoundBody(Obstacles):
     inner: Obstacles  # those of the ball about the position that the body holds
     points: BodyPoints
     box: tuple[tuple[float, ...], tuple[float, ...]] | None = None  # corners of the box that the balls cover, m
+    fixed: int = 0  # how many of the balls, the first, are in the vehicle's frame; others are of parts
 
     batched: ClassVar[tuple[str, ...]] = ("balls", "inner", "points")
 
@@ -246,10 +285,10 @@ class BoundBody(Obstacles):
     sizes = property(lambda self: self._joined("sizes"))  # type: ignore[assignment]
     radii = property(lambda self: torch.stack([ball.vehicle_radius for ball in self.balls], dim=-1))  # (B, P), m
     # Of the smallest ball about the position that holds the body, (B,), m.
-    reach = property(lambda self: (self.points.offsets.norm(dim=-1) + self.radii).amax(-1))
+    reach = property(lambda self: (self.points.lengths + self.radii).amax(-1))
     # How far it reaches out of the inscribed ball, (B,), m.
     overhang = property(lambda self: self.reach - self.inner.vehicle_radius)
-    calls_function = property(lambda self: self.points.attitude.calls_function)
+    calls_function = property(lambda self: any(f.calls_function for f in (self.points.attitude, *self.points.frames)))
 
     def __repr__(self) -> str:
         return f"Body({len(self.balls)} balls among {self.inner!r})"
@@ -326,7 +365,7 @@ class BoundBody(Obstacles):
         bars = inner.moving or inner.stops is not None or inner.absent.numel() == 0
         if bars or type(inner).chosen is Obstacles.chosen:
             return None
-        out = self.points.offsets.norm(dim=-1)
+        out = self.points.lengths
         away = inner.signed_distance(p, p.new_zeros(p.shape[1])).amin(1) + inner.vehicle_radius.unsqueeze(-1)  # (B, M)
         half = 0.5 * p.diff(dim=1).norm(dim=-1).amax(-1)  # a point of the way is so near to a knot
         least = away - ((out + self.radii).amax(-1) + half).unsqueeze(-1)

@@ -38,16 +38,17 @@ def extent(body: BoundBody, X: np.ndarray) -> np.ndarray:
 
 
 def silhouettes(body: BoundBody, X: np.ndarray, plane: Plane) -> list[np.ndarray]:
-    """Outlines (., 2), m, of the body in states X (K, n): of the box that is covered, or of each ball."""
+    """Outlines (., 2), m, of the body in states X (K, n): of the box that is covered, and of each other ball."""
+    (centers, radii), boxed = balls_at(body, X), 0 if body.box is None else body.fixed
+    rings = centers[:, boxed:, None, list(plane)] + radii[boxed:, None, None] * RAYS
+    balls = list(rings.reshape(-1, *RAYS.shape))
     if body.box is None:
-        centers, radii = balls_at(body, X)
-        rings = centers[:, :, None, list(plane)] + radii[:, None, None] * RAYS
-        return list(rings.reshape(-1, *RAYS.shape))
+        return balls
     corners = np.array(list(product(*zip(*body.box, strict=True))))
     turned = rotations(body, X) @ corners.T
     places = np.asarray(X)[:, None, body.position] + turned.swapaxes(-1, -2)
     seen = [vertices[:, list(plane)] for vertices in places]
-    return [points[ConvexHull(points).vertices] for points in seen]
+    return [*(points[ConvexHull(points).vertices] for points in seen), *balls]
 
 
 def rotations(body: BoundBody, X: np.ndarray) -> np.ndarray:

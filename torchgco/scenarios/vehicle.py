@@ -86,6 +86,8 @@ class Vehicle:
             axes, m: a `Body` of balls that cover it takes the place of the radius, of the layouts' too; None: the
             vehicle is a ball.
         cells: of a footprint, d whole numbers: how many balls there are along each axis, as of `Body.covering`.
+        shape: instead of a footprint any `Body`, also one with parts, such as a car with a trailer.
+        constraints: that every problem has besides, without numbers per problem.
 
     Raises:
         InputError: a field of another kind, length or out of its range; on `task`: layouts of another dimension, with
@@ -111,6 +113,8 @@ class Vehicle:
     arrives: Sequence[Natural] | None = None
     footprint: Sequence[Sequence[float]] | None = None
     cells: Sequence[Count] | None = None
+    shape: Body | None = None
+    constraints: Sequence[Constraint] | None = None
 
     def __post_init__(self) -> None:
         check_options(self, "vehicle")
@@ -124,6 +128,8 @@ class Vehicle:
             raise InputError("vehicle.arrives", f"some of the states 0..{n - 1}", repr(self.arrives))
         if (self.footprint is None) != (self.cells is None):
             raise InputError("vehicle.cells", "numbers for a footprint, and none without one", repr(self.cells))
+        if self.footprint is not None and self.shape is not None:
+            raise InputError("vehicle.shape", "none beside a footprint", self.shape)
         _ = self.body
         for names, length in ((STATE_ARRAYS, n), (CONTROL_ARRAYS, m)):
             for name in names:
@@ -174,9 +180,9 @@ class Vehicle:
 
     @property
     def body(self) -> Body | None:
-        """The balls that cover the footprint, turned by the model's heading or quaternion; None without one."""
+        """The shape, or balls that cover the footprint, turned by heading or quaternion; None for a ball."""
         if self.footprint is None or self.cells is None:
-            return None
+            return self.shape
         if len(self.footprint) != 2:
             raise InputError("vehicle.footprint", "two corners of a box", repr(self.footprint))
         attitude = "heading" if self.dimension == 2 else "quaternion"
@@ -259,7 +265,7 @@ class Vehicle:
             constraints.append(boxes if sines[0] is None else OscillatingBoxes(boxes, *map(tensor, sines)))
         if layouts.map is not None:
             constraints.append(Field(layouts.map, radius))
-        return constraints + self._state_bounds
+        return constraints + self._state_bounds + list(self.constraints or ())
 
     @property
     def _state_bounds(self) -> list[StateBounds]:

@@ -60,7 +60,7 @@ def car(problem: Problem) -> Car | None:
     if seen is None:
         return None
     z, n, (heading, speed) = seen.z, problem.n, seen.places
-    if any(part.points.attitude.of != heading for part in bodies):
+    if any(part.points.attitude.of != heading or part.points.frames for part in bodies):  # a pose doesn't place parts
         return None
     radius = max(float(part.vehicle_radius.max()) for part in bodies)
     if not alike(seen.rates[:, heading], z[0, :, speed] * seen.slopes[:, heading, speed]):

@@ -108,10 +108,10 @@ class Shape:
 
 
 def shape_of(problem: Problem) -> Shape | None:
-    """The body of a problem's vehicle; None where it is a ball."""
+    """The body of a problem's vehicle, without parts that turn by themselves; None where it is a ball."""
     if (body := body_of(problem)) is None:
         return None
-    offsets, radii = body.points.offsets[0].cpu().double().numpy(), body.radii[0].cpu().double().numpy()
+    offsets, radii = (values[0, : body.fixed].cpu().double().numpy() for values in (body.points.offsets, body.radii))
     balls = np.column_stack((offsets, np.zeros((len(offsets), 3 - offsets.shape[1])), radii))
     box = None if body.box is None else np.array(body.box)
     return Shape(balls, box, float((np.linalg.norm(offsets, axis=1) + radii).max()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, partial
 from typing import Annotated, Any, Literal
 
@@ -58,6 +58,7 @@ class Setup:
     device: torch.device
     dtype: torch.dtype
     mission: Mission | None = None  # with the solver under study as its planner's
+    metrics: Mapping[str, Callable[..., Any]] = field(default_factory=dict)  # of the user, see `study.metrics`
 
     def layouts(self, count: int | None = None) -> Layouts:
         """Layouts 0..count-1 under the seed; by default all of a file, or 64.
@@ -186,6 +187,7 @@ def build(configuration: dict[str, Any]) -> Setup:
         seed=configuration["seed"],
         device=device,
         dtype=dtype,
+        metrics=metrics_of(configuration),
     )
     setup = replace(setup, mission=_mission(setup))
     if model["dimension"] != setup.vehicle.dimension:
@@ -256,6 +258,19 @@ def _closed_loop(made: Any, plant: Any, solver: Any, vehicle: Vehicle) -> Missio
         return made(planner=planner, plant=plant)
     except TypeError as error:
         raise as_input_error(error, field) from None
+
+
+def metrics_of(configuration: Mapping[str, Any]) -> dict[str, Callable[..., Any]]:
+    """The functions of `study.metrics` by name: each the path of one, or a node with the path as `_target_`."""
+    nodes = configuration["study"].get("metrics") or {}
+    if not isinstance(nodes, Mapping):
+        raise InputError("study.metrics", "functions by name, such as {jerk: own.jerk}", repr(nodes))
+    made = {}
+    for name, node in nodes.items():
+        whole, field = node if isinstance(node, Mapping) else {"_target_": node}, f"study.metrics.{name}"
+        check_value(whole.get("_target_"), str, field)
+        made[str(name)] = _instantiate({**whole, "_partial_": True}, field)
+    return made
 
 
 def solver_of(configuration: Mapping[str, Any]) -> Any:

@@ -22,9 +22,11 @@ from hydra.core.object_type import ObjectType
 from omegaconf import OmegaConf
 
 from torchgco.base.version import PACKAGE
+from torchgco.constraints import Cone, ControlBounds, NormBounds, RateBounds, StateBounds
 from torchgco.dynamics import Airframe
 from torchgco.exploration import SensorMission
 from torchgco.missions import Disturbance, Planner, RaceMission, RacePlanner, RotorPlant, Tracker
+from torchgco.obstacles import Body
 from torchgco.presets import PRESETS
 from torchgco.scenarios import FAMILIES, Floors, LayoutFile, MapFile
 from torchgco.scenarios.maps import DRAWN_PACES
@@ -36,6 +38,8 @@ ANYWHERE = {2: "unicycle", 3: "quadrotor"}  # the model for layouts that give po
 BY_DIMENSION = "torchgco.by_dimension"
 SHARED_FIELDS = ("airframe", "dt")  # fields that the parts of a mission share: a change would have to be made in each
 HELP_WIDTH = 100  # of the help page
+# Classes that a vehicle's `shape` and `constraints` may name in files of others: they call no function of theirs.
+OF_MODELS = frozenset({Body, Cone, ControlBounds, NormBounds, RateBounds, StateBounds})
 _targets: dict[str, set[str]] = {}  # paths of the classes that registered options make, by group
 
 
@@ -119,7 +123,7 @@ def classes_of(group: str) -> frozenset[type]:
     """The classes that the options of a group make, parts included: registered options and files of conf/."""
     trees = [OmegaConf.to_container(OmegaConf.load(path)) for path in (config_dir() / group).glob("*.yaml")]
     named = {*_targets.get(group, ()), *(target for tree in trees for target in _named(tree))}
-    parts = classes_of("vehicle") if group == "model" else ()  # a model holds the airframe that is chosen there
+    parts = classes_of("vehicle") | OF_MODELS if group == "model" else ()  # a model holds the airframe chosen there
     return frozenset(hydra.utils.get_class(target) for target in named) | frozenset(parts)
 
 

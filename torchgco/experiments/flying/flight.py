@@ -6,7 +6,7 @@ import sys
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import Annotated, Any, Literal
@@ -23,20 +23,22 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import MAX_PROCESSES, Setup
 from torchgco.experiments.config.launching import allotted_cores, jobs_at_once
+from torchgco.experiments.flying.metrics import metric_columns
 from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.results.durations import judged_columns, with_lengths
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
 from torchgco.kernels import use_native
+from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import Layouts, Task
 from torchgco.search.reach import short_horizons
 from torchgco.solution import Solution
-from torchgco.solvers.contracts import Progress
+from torchgco.solvers.contracts import CHOOSING_TIME, Progress
 from torchgco.solvers.memory import is_out_of_memory, plan_batch
 
-Flown = tuple[str, tuple[pd.DataFrame, np.ndarray]]  # a solver's name, its rows and controls
+Flown = tuple[str, Any]  # a solver's name, and what its batch returned
 REDRAW = 0.5  # s between two drawings of the bar
 PROVEN = 1e-6  # a KKT residual up to which nobody asks for a smaller one: that of a solve that ended by itself
 NOT_FLOWN = (Status.INVALID_START.name, Status.NON_FINITE.name)
@@ -105,6 +107,16 @@ def plan_of(setup: Setup) -> Schedule:
     return replace(plan, workers=max(1, cores // torch.get_num_threads()))
 
 
+def check_time(task: Task, solvers: Mapping[str, Any]) -> None:
+    """Refuse solvers that can't choose a free time before any of them flies."""
+    if task.problem.time is None:
+        return
+    problem = for_solvers(task.problem)
+    for index, (name, solver) in enumerate(solvers.items()):
+        if solver.choosing_time(problem) is None:
+            raise InputError("study.baselines" if index else "solver", f"{CHOOSING_TIME}, as it is free here", name)
+
+
 @dataclass
 class Batch(ABC):
     """A batch of a study's layouts that one solver flies, and how much of it the bar has shown."""
@@ -137,8 +149,8 @@ class Batch(ABC):
         return self.tasks.layouts.take(self.places)
 
     @abstractmethod
-    def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
-        """Rows (without success), and what is kept of each flight (L, ...)."""
+    def fly(self) -> Any:
+        """What is kept of the flights: of a study rows (without success), and an array (L, ...)."""
 
     def compile(self) -> None:
         """Compile what is known to be needed: where several processes fly, once for all, and beside no solve."""
@@ -148,6 +160,17 @@ class Batch(ABC):
         """Move the bar to so many layouts."""
         self.bar.update(max(0.0, done - self.shown))
         self.shown = max(self.shown, done)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Layouts of a batch as a solver left them, and as they were judged."""
+
+    task: Task
+    solution: Solution
+    rows: pd.DataFrame  # without success
+    U: np.ndarray  # (L, N, m), float64, NaN where nothing was flown
+    times: np.ndarray | None  # (L, N+1) of the knots, s, where the time is free
 
 
 @dataclass
@@ -184,6 +207,11 @@ class SolveBatch(Batch):
 
     def _fly(self, places: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
         """The same of layouts with as many stages and gates."""
+        solved = self.solved(places)
+        return solved.rows, solved.U if solved.times is None else with_lengths(solved.U, solved.times)
+
+    def solved(self, places: np.ndarray) -> Solved:
+        """Layouts with as many stages and gates, solved and judged."""
         setup, self.shown = self.setup, 0
         task, layouts = self.tasks.of(places), self.tasks.layouts.take(places)
         ids = torch.as_tensor(layouts.ids, device=setup.device)
@@ -204,13 +232,14 @@ class SolveBatch(Batch):
             {
                 **self.shared, "layout": layouts.ids, "status": statuses, **columns,
                 **certificate_columns(certificate),
+                **metric_columns(setup.metrics, checked.problem, U, times, layouts.ids),
                 "iterations": solution.iterations.cpu().numpy(),
                 "outer_iterations": solution.outer_iterations.cpu().numpy(),
                 "guided": solution.guided.cpu().numpy(), "seconds": seconds, "batch_size": together,
                 "kernels": (solution.account and solution.account.kernels) or "",
             }
         )  # fmt: skip
-        return rows, U.numpy() if times is None else with_lengths(U.numpy(), times.numpy())
+        return Solved(task, solution, rows, U.numpy(), None if times is None else times.numpy())
 
     def _solve(self, problem: Problem, U0: Tensor, ids: Tensor) -> tuple[Solution, float, np.ndarray]:
         """The solution, seconds per problem, and how many problems at most ran at the same time as each of them (L,).

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from tqdm import tqdm
 
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
@@ -19,18 +17,20 @@ from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.fleet_flight import FleetBatch, check_fleets
-from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, fly, plan_of, prepare
+from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, check_time, plan_of
+from torchgco.experiments.flying.metrics import check_metrics
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionBatch
-from torchgco.experiments.flying.progress import BAR_FORMAT, Bar, Lines, lines_alone
+from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
-from torchgco.experiments.flying.workers import Shared, run_all
+from torchgco.experiments.flying.together import cut, fly_all, trial_bar
+from torchgco.experiments.flying.workers import Shared
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.fleet_report import write_fleet_report
 from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.durations import states_of, times_at
-from torchgco.experiments.results.folder import DONE, JUDGED, StudyFolder
+from torchgco.experiments.results.folder import COLUMNS, DONE, JUDGED, StudyFolder
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
@@ -45,11 +45,8 @@ from torchgco.experiments.results.objective import check_objective
 from torchgco.experiments.results.provenance import recorded
 from torchgco.experiments.results.success import with_success
 from torchgco.experiments.results.variants import values_of
-from torchgco.kernels import native
 from torchgco.missions import Mission
-from torchgco.problem.horizons import for_solvers
 from torchgco.scenarios import Layouts, Task
-from torchgco.solvers.contracts import CHOOSING_TIME
 
 # From a baseline's name to the whole configuration with that solver.
 Recompose = Callable[[str], dict[str, Any]]
@@ -189,6 +186,11 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
         check_fleets(setup, tasks.layouts, plan)
     else:
         task = tasks.of([0], exact=True)  # raises where model and layouts don't fit
+    if setup.metrics:
+        if fleets or setup.mission is not None:
+            raise InputError("study.metrics", "null for missions and fleets", ", ".join(setup.metrics))
+        first = tasks.of(tasks.groups[0][:2], exact=True)
+        check_metrics(setup.metrics, COLUMNS, first.problem, first.U0)
     if (objective := configuration["study"]["objective"]) is not None:
         check_objective(objective, setup.mission is not None)
         if plan.jobs is not None:
@@ -202,7 +204,7 @@ def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
     rivals = _rivals(configuration, recompose)
     solvers = {name: setup.solver if config is configuration else solver_of(config) for name, config in rivals.items()}
     if setup.mission is None and not fleets:
-        _check_time(task, solvers)
+        check_time(task, solvers)
     plant = None if setup.mission is None else setup.mission.plant
     decided = {**configuration, **files_of(configuration, getattr(plant, "files", ()))}
     manifest = Manifest(
@@ -221,16 +223,6 @@ def check_mission(mission: Mission, task: Task) -> None:
         raise InputError("mission.duration", f"at least one control period, {dynamics.dt:g} s", mission.duration)
 
 
-def _check_time(task: Task, solvers: Mapping[str, Any]) -> None:
-    """Refuse solvers that can't choose a free time before any of them flies."""
-    if task.problem.time is None:
-        return
-    problem = for_solvers(task.problem)
-    for index, (name, solver) in enumerate(solvers.items()):
-        if solver.choosing_time(problem) is None:
-            raise InputError("study.baselines" if index else "solver", f"{CHOOSING_TIME}, as it is free here", name)
-
-
 def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, dict[str, Any]]:
     """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
     studied = configuration["solver"]["name"]
@@ -247,32 +239,15 @@ def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, di
 
 def _fly(study: _Study, store: StudyFolder, missing: Mapping[str, Sequence[int]], name: str) -> None:
     """Fly the missing layouts of every solver, and keep them as shards."""
-    batches = [(name, ids) for name, left in missing.items() for ids in _cut(left, study.plan.shard_size)]
+    batches = [(name, ids) for name, left in missing.items() for ids in cut(left, study.plan.shard_size)]
     if not batches:
         return
-    with _bar(study, sum(map(len, missing.values())), name) as bar:
+    count = len(study.plan.share(range(study.layouts.count), study.layouts.count)) * len(study.solvers)
+    with trial_bar(name, count, sum(map(len, missing.values()))) as bar:
         workers = min(study.plan.workers or 1, len(batches))
-        if workers > 1:
-            _fly_side_by_side(study, store, batches, workers, bar)
-        else:  # in this process, with a bar that moves inside a batch
-            for name, ids in batches:
-                bar.set_description(name)
-                store.keep(name, _flight(study, name, ids, bar).fly())
-
-
-def _bar(study: _Study, left: int, name: str) -> tqdm | Lines:
-    """Progress over the trials that this process flies, those flown before included."""
-    layouts = len(study.plan.share(range(study.layouts.count), study.layouts.count))
-    count = layouts * len(study.solvers)
-    if lines_alone():
-        return Lines(name, count, count - left)
-    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=BAR_FORMAT)
-
-
-def _cut(ids: Sequence[int], size: int) -> list[list[int]]:
-    """The ids in batches of at most `size` that follow each other without a gap."""
-    runs = np.split(np.array(ids, int), np.flatnonzero(np.diff(ids) != 1) + 1)
-    return [run[first : first + size].tolist() for run in runs for first in range(0, len(run), size)]
+        seen = Shared() if workers > 1 else bar
+        flights = [_flight(study, name, ids, seen, alone=workers > 1) for name, ids in batches]
+        fly_all(flights, workers, bar, lambda flown: store.keep(*flown))
 
 
 def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar, alone: bool = False) -> Batch:
@@ -285,39 +260,6 @@ def _flight(study: _Study, name: str, ids: Sequence[int], bar: Bar, alone: bool 
         most = None if study.layouts.stages is None else int(np.max(study.layouts.stages))
         return batch(tasks, places, name, solver, bar, most)
     return MissionBatch(tasks, places, name, solver, bar, plans=study.layouts.count <= PLANS_KEPT)
-
-
-def _fly_side_by_side(
-    study: _Study, store: StudyFolder, batches: Sequence[tuple[str, list[int]]], workers: int, bar: tqdm | Lines
-) -> None:
-    """Fly the batches by several processes; this one writes the shards."""
-
-    shown = 0.0
-
-    total = sum(len(ids) for _, ids in batches)
-
-    def watch(finished: float) -> None:
-        nonlocal shown
-        bar.update(max(0.0, finished - shown))
-        shown = max(shown, finished)
-        bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
-
-    flights = [_flight(study, name, ids, Shared(), alone=True) for name, ids in batches]
-    bar.set_description("compiling")
-    for name in study.solvers:
-        if first := next((flight for flight in flights if flight.name == name), None):
-            first.compile()
-    bar.set_description(f"{workers} processes")
-    run_all(
-        fly,
-        flights,
-        workers,
-        prepare=prepare,
-        options=(torch.get_num_threads(), native()),
-        keep=lambda flown: store.keep(*flown),
-        watch=watch,
-        say=lambda line: bar.write(line, sys.stderr),
-    )
 
 
 def _update(study: _Study, store: StudyFolder, swept: Sequence[str]) -> None:

@@ -29,11 +29,13 @@ from torchgco.experiments.results.folder import LAYOUTS, MANIFEST, SOLUTIONS, TR
 from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
+from torchgco.experiments.statistics.families import families_text, over_families
 from torchgco.experiments.statistics.power import in_words
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
+from torchgco.plotting.families import families_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
 from torchgco.plotting.rates import rates_figure, sweep_figure
@@ -169,10 +171,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folders", nargs="*", metavar="DIR", type=Path, help="a study, or a folder of studies")
     parser.add_argument("--output", metavar="DIR", type=Path, help="default: 'report' in the first DIR")
     parser.add_argument("--format", choices=OUTPUTS, default="table", help="of the tables on stdout; default: table")
+    instead = parser.add_mutually_exclusive_group()
     words = "one table of all trials in place of statistics: trials.csv, and on stdout with --format"
-    parser.add_argument("--long", action="store_true", help=words)
+    instead.add_argument("--long", action="store_true", help=words)
+    words = "compare solvers over all families by a column, such as cost or seconds: profiles, ranks; families.csv"
+    instead.add_argument("--families", metavar="COLUMN", help=words)
     words = "print how many layouts tell two rates apart, such as 0.9 0.8, and no report"
-    parser.add_argument("--power", nargs=2, type=float, metavar="RATE", help=words)
+    instead.add_argument("--power", nargs=2, type=float, metavar="RATE", help=words)
     parser.add_argument("--pdf", action="store_true", help="figures as PDF instead of PNG")
     parser.add_argument("--verify", action="store_true", help="confirm all rows and tables from the stored controls")
     return parser.run(arguments, _run)
@@ -200,8 +205,12 @@ def _report(options: argparse.Namespace) -> int:
     write(output / TRIALS, lambda file: plain(merged).to_parquet(file, index=False, use_dictionary=text))
     trials = merged.copy(deep=False)
     trials.attrs = {}  # pandas copies them for every table that it makes from this one
-    long = _long(output, trials, options.format) if options.long else None
-    say(long or write_report(output, trials=trials, form=options.format, pdf=options.pdf))
+    if options.long:
+        say(_long(output, trials, options.format))
+    elif options.families is not None:
+        say(_families(output, trials, options))
+    else:
+        say(write_report(output, trials=trials, form=options.format, pdf=options.pdf))
     repeated = merged.attrs[REPEATED]
     notes = [f"{repeated} rows left out: another run has the same flight, and each counts once"] if repeated else []
     for note in [*notes, f"written to {output}"]:
@@ -219,6 +228,15 @@ def _long(output: Path, trials: pd.DataFrame, form: str) -> str:
     table = plain(trials)
     write(output / "trials.csv", lambda file: file.write(csv_text(table).encode()))
     return f"{len(table)} trials, {len(table.columns)} columns" if form == "table" else format_frame(table, form)
+
+
+def _families(output: Path, trials: pd.DataFrame, options: argparse.Namespace) -> str:
+    """Write families.csv and its figure; returns what to print."""
+    table = over_families(trials, options.families)
+    write(output / "families.csv", lambda file: file.write(csv_text(table).encode()))
+    name = "families.pdf" if options.pdf else "families"
+    draw({name: partial(_draw, output, name, partial(families_figure, table, options.families))})
+    return families_text(table, options.families, options.format)
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -18,7 +18,9 @@ import pandas as pd
 import torch
 
 from torchgco.base.errors import InputError
+from torchgco.experiments.config.build import metrics_of
 from torchgco.experiments.flying.fleet_flight import VEHICLES, fleet_columns, vehicles_table
+from torchgco.experiments.flying.metrics import metric_columns
 from torchgco.experiments.flying.mission_flight import FAILED
 from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study
 from torchgco.experiments.results.durations import judged_columns
@@ -193,10 +195,11 @@ def _identity(study: Study, index: pd.MultiIndex) -> pd.DataFrame:
 
 def _trajectories(study: Study) -> pd.DataFrame:
     """The judged columns of single trajectories, by (solver, layout)."""
-    parts = []
+    metrics, parts = metrics_of(study.manifest.configuration) if study.trust else {}, []  # code of a user runs
     for places, task in study.tasks():
         for name in study.manifest.solvers:
-            _, columns = judged_columns(task, *study.flight(name, places, task.problem.N))
+            U, times = study.flight(name, places, task.problem.N)
+            columns = judged_columns(task, U, times)[1] | metric_columns(metrics, task.problem, U, times, None)
             parts.append(pd.DataFrame({"solver": name, "layout": task.layouts.ids, **columns}))
     return _with_success(study, parts)
 

@@ -48,12 +48,13 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
 
     The rows of a solver's table work in their order, of which `digest` takes no notice: it stands as a list.
     """
+    metrics = (configuration.get("study") or {}).get("metrics")
     passes = {name: settings.get("passes") for name, settings in solvers.items()}
     return {
         "scenario": configuration["scenario"],
         "model": {"vehicle": configuration["model"]["vehicle"]},
         "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
-        "study": {"solvers": list(solvers)},
+        "study": {"solvers": list(solvers), **({"metrics": metrics} if metrics else {})},
         "solvers": dict(solvers),
         "order": {name: list(rows) for name, rows in passes.items() if isinstance(rows, Mapping)},
         **closed_loop(configuration),

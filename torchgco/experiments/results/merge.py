@@ -156,18 +156,21 @@ def _variant(run: Run, settings: Mapping[str, dict[str, Any]], code: str, device
 
 
 def _without_repetitions(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
-    """Each flight once: as the first run has it, but one whose success is known before one whose isn't.
+    """Each flight once: as the first run has it, but one whose success and metrics are known before others.
 
     Raises:
         InputError: two runs give one flight different content.
     """
-    content = [name for name in rows.columns if name not in INCIDENTAL | {RUN} and not name.startswith(OPTION)]
+    own = {name for run in runs for name in (run.configuration.get("study") or {}).get("metrics") or ()}
+    left_out = INCIDENTAL | {RUN} | own  # a study may have metrics that another hasn't
+    content = [name for name in rows.columns if name not in left_out and not name.startswith(OPTION)]
     flight = [*dict.fromkeys([*task_columns(rows), *ROW]), VARIANT, "layout_digest"]
     repeated = rows.duplicated(flight, keep=False)
     twins = rows[repeated]
     if twins.empty:
         return rows
-    twins = twins.loc[twins["success"].isna().sort_values(kind="stable").index].drop_duplicates(content)
+    unknown = twins[["success", *(name for name in rows.columns if name in own)]].isna().sum(axis=1)
+    twins = twins.loc[unknown.sort_values(kind="stable").index].drop_duplicates(content)
     disputed = twins.duplicated(flight, keep=False)
     if disputed.any():
         raise _dispute(twins[disputed], content, runs)

@@ -50,13 +50,15 @@ GIT_PATIENCE = 10.0  # s, for git
 
 
 @contextmanager
-def recorded(folder: Path, setup: Setup, plan: Schedule, command: Sequence[str]) -> Iterator[list[str]]:
+def recorded(
+    folder: Path, setup: Setup, plan: Schedule, command: Sequence[str], program: str = "torchgco"
+) -> Iterator[list[str]]:
     """Record a start in the study's folder, and how it ended: the last word that the block appends, or "finished"."""
     path = folder / (RECORD if plan.job is None else f"run-{plan.job}-of-{plan.jobs}.json")
     began, used = time.perf_counter(), _processor_seconds()
     entries: list[dict[str, Any]] = []
     with suppress(Exception):
-        entries = [*_held(path), _entry(setup, plan, command)]
+        entries = [*_held(path), _entry(setup, plan, [program, *command])]
         _keep(path, entries)
     ending: list[str] = []
     how = "failed"
@@ -76,8 +78,8 @@ def recorded(folder: Path, setup: Setup, plan: Schedule, command: Sequence[str])
 
 def _entry(setup: Setup, plan: Schedule, command: Sequence[str]) -> dict[str, Any]:
     return {
-        "command": shlex.join(["torchgco", *command]),
-        "torchgco": _or_none(_source),
+        "command": shlex.join(command),
+        "torchgco": _or_none(source),
         "packages": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "machine": {
             "platform": platform.platform(), "processor": _or_none(_processor), "cores": os.cpu_count(),
@@ -107,7 +109,7 @@ def _keep(path: Path, entries: list[dict[str, Any]]) -> None:
     write(path, lambda file: file.write(json.dumps(entries, indent=1).encode()))
 
 
-def _source() -> dict[str, Any]:
+def source() -> dict[str, Any]:
     """Version, and commit of a checkout. An installed package may lie in a checkout of something else: no commit."""
     root = PACKAGE.parent
     source: dict[str, Any] = {"version": VERSION, "commit": None, "changed": None}

@@ -79,6 +79,23 @@ def compare(trials: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(list(flights.rows()), columns=[*columns, *PairedResult.__dataclass_fields__])
 
 
+def trial_numbers(trials: pd.DataFrame) -> np.ndarray:
+    """One number (rows,) per trial, the same for all solvers: of a layout and seed of a task."""
+    digest = ["layout_digest"] if "layout_digest" in trials.columns else []
+    trial = [*task_columns(trials), *PAIR[len(TASK) :], *digest]
+    return trials.groupby(trial, sort=False, dropna=False, observed=True).ngroup().to_numpy()
+
+
+def check_single(trials: pd.DataFrame, trial: np.ndarray, solver: str, rows: np.ndarray) -> None:
+    """Raise InputError where a solver has two of `rows` for one trial; `trial`: see `trial_numbers`."""
+    ordered = rows[np.argsort(trial[rows], kind="stable")]
+    repeated = ordered[1:][np.diff(trial[ordered]) == 0]
+    if len(repeated):
+        row = trials[PAIR].iloc[repeated.min()]
+        first = ", ".join(f"{name} {value}" for name, value in row.items())
+        raise InputError("trials", f"one row of {solver} for {first}", "two")
+
+
 def _bare(solver: str) -> str:
     """A solver's name without the label that a merge gave it."""
     return solver.split(" [")[0]
@@ -89,10 +106,7 @@ class _Flights:
 
     def __init__(self, trials: pd.DataFrame) -> None:
         self.trials = trials
-        digest = ["layout_digest"] if "layout_digest" in trials.columns else []
-        # One number per trial, the same for all solvers.
-        trial = [*task_columns(trials), *PAIR[len(TASK) :], *digest]
-        self.trial = trials.groupby(trial, sort=False, dropna=False, observed=True).ngroup().to_numpy()
+        self.trial = trial_numbers(trials)
         self.solver, names = pd.factorize(trials["solver"])
         self.names = [str(name) for name in names]
         self.hits = attained(trials, grouped(trials, [*task_columns(trials), "solver"]))
@@ -113,17 +127,9 @@ class _Flights:
         """Positions of two solvers' rows of the trials that both flew, among `rows`, and how many only one flew."""
         rows_a, rows_b = (rows[self.solver[rows] == self.names.index(name)] for name in (a, b))
         for name, positions in ((a, rows_a), (b, rows_b)):
-            self._check_single(name, positions)
+            check_single(self.trials, self.trial, name, positions)
         _, in_a, in_b = np.intersect1d(self.trial[rows_a], self.trial[rows_b], assume_unique=True, return_indices=True)
         return rows_a[in_a], rows_b[in_b], len(rows_a) + len(rows_b) - 2 * len(in_a)
-
-    def _check_single(self, solver: str, rows: np.ndarray) -> None:
-        ordered = rows[np.argsort(self.trial[rows], kind="stable")]
-        repeated = ordered[1:][np.diff(self.trial[ordered]) == 0]
-        if len(repeated):
-            row = self.trials[PAIR].iloc[repeated.min()]
-            first = ", ".join(f"{name} {value}" for name, value in row.items())
-            raise InputError("trials", f"one row of {solver} for {first}", "two")
 
     def compared(self, rows: np.ndarray, a: str, b: str) -> Iterator[PairedResult]:
         """Two solvers' rows among `rows`, compared by each outcome."""
