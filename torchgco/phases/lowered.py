@@ -8,9 +8,7 @@ jump's stage are the jump's, then the time of the next phase, where that is free
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import dataclass, field, replace
-from operator import is_
 from typing import Any, ClassVar, Self
 
 import torch
@@ -26,7 +24,6 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.phases.jump import Jump
 from torchgco.phases.phases import Phases
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
 
 IDLE = 0.5  # cost of a control that a stage lacks, per unit squared: it makes the minimum, at 0, strict
@@ -78,15 +75,15 @@ class Whole:
     """Phases as one problem.
 
     Attributes:
-        members: the problem of each phase, with its numbers as they are now.
+        members: the problem of each phase.
         forms: the same as solvers see them.
         landings: the jumps.
         spans: of the phases; of the jumps `spans_between`.
-        problem: all of it, of which nothing is known yet.
+        problem: all of it.
     """
 
     def __init__(self, phases: Phases) -> None:
-        self.phases, self.members = phases, tuple(one.current() for one in phases.members)
+        self.phases, self.members = phases, phases.members
         self.forms = tuple(for_solvers(one) for one in self.members)
         self.landings = tuple(
             Landing(jump, one.time is not None, form.x0[:, one.n + (one.time is not None) :])
@@ -101,14 +98,6 @@ class Whole:
             for span, landing in zip(self.spans, self.landings, strict=False)
         )
         self.problem = self._problem()
-
-    @classmethod
-    def current(cls, phases: Phases, before: Whole | None) -> Whole:
-        """Phases with their numbers as they are now, to be solved; of the whole `before` what can't have changed."""
-        members = (one.current() for one in phases.members)
-        whole = copy(before) if before is not None and all(map(is_, members, before.members)) else cls(phases)
-        whole.problem = whole.problem._with({}, Known(current=True))
-        return whole
 
     def _problem(self) -> Problem:
         first, N = self.forms[0], self.spans[-1].first + self.spans[-1].N

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from operator import is_
 from typing import Any
 
 from torchgco.base.errors import InputError, shown
 from torchgco.constraints.link import Link
 from torchgco.costs.base import Cost
 from torchgco.phases.jump import Jump, linked
+from torchgco.problem.given import facts_of
 from torchgco.problem.problem import Problem
+
+RENEWED = "renewed"  # what phases keep: the ones of other numbers that were made last
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Phases:
     members: tuple[Problem, ...] = field(init=False, repr=False)
     between: tuple[Jump, ...] = field(init=False, repr=False)  # bound, one fewer
     derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
+    facts: tuple[Hashable, ...] = field(init=False, repr=False, compare=False)  # of the numbers of jumps
 
     def __post_init__(self) -> None:
         if not isinstance(self.problems, Sequence) or not all(isinstance(one, Problem) for one in self.problems):
@@ -52,6 +57,7 @@ class Phases:
         for i, one in enumerate(self.problems):
             _check(one, self.problems[0], i)
         object.__setattr__(self, "members", tuple(self.problems))
+        object.__setattr__(self, "facts", self._facts())
         object.__setattr__(self, "between", _between(self.jumps, self.members))
         if not isinstance(self.loop, Link | None):
             raise InputError("phases.loop", "a Link, or None", shown(self.loop))
@@ -65,6 +71,18 @@ class Phases:
     def B(self) -> int:
         """How many problems of phases."""
         return self.members[0].B
+
+    def current(self) -> Phases:
+        """The same phases with numbers as they are now, where these were changed in place since; else these."""
+        members, facts = tuple(one.current() for one in self.members), self._facts()
+        for made in (self, self.derived.get(RENEWED, self)):
+            if facts == made.facts and all(map(is_, members, made.members)):
+                return made
+        self.derived[RENEWED] = renewed = replace(self, problems=members)
+        return renewed
+
+    def _facts(self) -> tuple[Hashable, ...]:
+        return tuple(facts_of((self.jumps, self.loop)))
 
 
 def _kind(one: Problem) -> tuple[Any, ...]:

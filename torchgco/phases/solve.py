@@ -7,12 +7,13 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import computing_on
 from torchgco.judging.steps import Costates
-from torchgco.kernels import costates
+from torchgco.kernels import costates, current
 from torchgco.phases.guess import Rest, guess
 from torchgco.phases.lowered import Span, Whole
 from torchgco.phases.phases import Phases
@@ -42,14 +43,17 @@ def solve_phases(
         rest: controls at rest.
     """
     with computing_on(phases.members[0].x0.device):
-        whole = phases.derived[WHOLE] = Whole.current(phases, phases.derived.get(WHOLE))
+        phases = phases.current()
+        whole = phases.derived[WHOLE] = phases.derived.get(WHOLE) or Whole(phases)
         if any(one.time is not None for one in whole.members) and solver.choosing_time(whole.problem) is None:
             raise InputError("solver", CHOOSING_TIME, type(solver).__name__)
         X, U = guess(whole, U0, X0, rest) if warm is None else _warm(whole, warm)
-        problem = whole.problem.guessing(X[:, 0])
+        standing = current(whole.problem, looked_at=True)
+        problem = _guessing(standing, X[:, 0])
         X = X if solver.take_states(problem) else None
         multipliers = None if warm is None else warm.found.multipliers
         found = solver.solve(problem, U, seed, ids, multipliers, None, max_seconds, X)
+        standing.derived.update(_scale(problem))
         status = found.status
         for form, span in zip(whole.forms, whole.spans, strict=True):
             status = judged_between(form, *span.own(found.X, found.U), status)
@@ -58,6 +62,22 @@ def solve_phases(
         for member, part, span in zip(whole.members, solution, whole.spans, strict=True):
             warn_of(member, part, False, _costates(member, span, slopes))
         return solution
+
+
+def _guessing(problem: Problem, x: Tensor) -> Problem:
+    """All of the phases with a guess x (B, n) of what is free in the first start.
+
+    The scale of the cost, once it is known, doesn't depend on that: there each phase stays where it is given to begin.
+    """
+    x0 = problem.start_in(x)
+    if torch.equal(x0, problem.x0):
+        return problem
+    return problem._with({"x0": x0}, problem.known, _scale(problem))
+
+
+def _scale(problem: Problem) -> dict[str, Any]:
+    """What the problem has derived of the scale of its cost."""
+    return {name: made for name, made in problem.derived.items() if name == "cost_scale"}
 
 
 def _costates(member: Problem, span: Span, slopes: Callable[[], Tensor | None]) -> Costates:

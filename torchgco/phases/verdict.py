@@ -48,10 +48,10 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
     if not isinstance(solution, PhasesSolution) or len(solution) != len(phases):
         raise InputError("solution", f"a PhasesSolution of {len(phases)} phases", shown(solution))
     with computing_on(phases.members[0].x0.device):
-        verdicts, start, end = list[Verdict](), None, None
+        phases, verdicts, start, end = phases.current(), list[Verdict](), None, None
         cost = violation = torch.zeros_like(solution.cost, dtype=torch.float64)
         for i, (member, part) in enumerate(zip(phases.members, solution.parts, strict=True)):
-            member = in_double(member.current())
+            member = in_double(member)
             U = doubled(part.U, "U", member)
             times = None if part.times is None else doubled(part.times, "times", member)
             if start is not None:
