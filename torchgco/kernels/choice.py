@@ -49,20 +49,17 @@ class EagerWarning(UserWarning):
     """Native kernels can't be used for a problem; PyTorch's are, which takes longer."""
 
 
-def current(problem: Problem, looked_at: bool = False) -> Problem:
+def current(problem: Problem) -> Problem:
     """The problem as its parts are now: nothing is kept from an earlier solve but what can't have changed since.
 
     Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed,
     and then code of the same computation alone is kept. While neither they nor the problem's own numbers have changed,
     all stays that was made of them: forms, scales, structures that C reads. Within a solve, subsets and other forms of
     the problem share the kernels of its beginning.
-
-    Args:
-        looked_at: the caller has seen that the numbers are as they were from which it made the problem.
     """
     if problem.known.current:
         return problem
-    facts, (then, before) = _standing(problem, looked_at), problem.derived.get(CURRENT, (None, problem))
+    facts, (then, before) = _standing(problem), problem.derived.get(CURRENT, (None, problem))
     if facts is not None and facts == then and before.known.in_c is not False and _has_code(before):
         return before
     fresh = problem.renewed()
@@ -72,12 +69,12 @@ def current(problem: Problem, looked_at: bool = False) -> Problem:
     return fresh
 
 
-def _standing(problem: Problem, looked_at: bool) -> tuple[Hashable, ...] | None:
+def _standing(problem: Problem) -> tuple[Hashable, ...] | None:
     """What says whether the numbers of a problem of torchgco's own parts are as they were; None of others.
 
     Those that it was given are looked at by `Problem.current`; into what it has made of them PyTorch alone writes.
     """
-    if problem.given is None and not looked_at:
+    if problem.given is None:
         return None
     own = problem.derive(OWN, lambda: _own_tensors(problem))
     return None if own is None else (find_compiler(), *(tensor._version for tensor in own))

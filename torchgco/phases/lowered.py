@@ -7,7 +7,7 @@ jump's stage are the jump's, then the time of the next phase, where that is free
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, inf
 from torch.nn.functional import pad
 
+from torchgco.base.gradients import recording
 from torchgco.base.shapes import Dimensions, repeated
 from torchgco.base.tree import PerElement, is_users
 from torchgco.constraints.base import Constraint, WrappedConstraint
@@ -116,7 +117,9 @@ class Whole:
             "constraints": tuple(self._rows(stretch)),
             "goal": None, "horizon": None, "time": None,
         }  # fmt: skip
-        return first._with(parts)
+        whole = first._with(parts)
+        whole._set(given=_Given(self.phases))
+        return whole
 
     def _rows(self, stretch: Stretch) -> Iterator[Constraint]:
         for form, span in zip(self.forms, self.spans, strict=True):
@@ -125,15 +128,37 @@ class Whole:
         for landing, jump, span in zip(self.landings, self.phases.between, self.spans_between, strict=True):
             for row in jump.constraints:
                 yield _shifted(row, replace(span, n=landing.jump.n, m=jump.controls), stretch)
-        if self.phases.loop is not None:
+        if self.phases.closing is not None:
             x0 = self.members[0].x0
             dims = Dimensions(len(x0), stretch.N, self._common, stretch.m, None, None, x0)
-            yield self.phases.loop.bind(dims)
+            yield self.phases.closing.bind(dims)
 
     @property
     def _common(self) -> int:
         """How many states the first phase and the last one have in common."""
         return min(self.members[0].n, self.members[-1].n)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What the problem of all phases was made of, as `problem.given` tells it."""
+
+    phases: Phases
+
+    asks = property(lambda self: self.phases.asks)
+
+    def current(self, problem: Problem) -> Problem:
+        """The problem: phases are looked at when it is made of them."""
+        return problem
+
+    def recorded(self, problem: Problem) -> Problem:
+        """The same with gradients recorded."""
+        live = self.phases.recorded()
+        with recording():
+            return Whole(live).problem
+
+    def followed(self, whole: Problem, by: Callable[[Problem], Problem]) -> None:
+        """Nothing of what is made of it."""
 
 
 @dataclass(frozen=True)

@@ -63,16 +63,16 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
                 jump, v = cast(phases.between[i], torch.float64), doubled(solution.jumps[i], "jumps", member)
                 cost, violation = cost + jump.costs(end, v), torch.maximum(violation, jump.violation(end, v))
                 start = jump.after(end, v)
-        if phases.loop is not None and end is not None:
+        if phases.closing is not None and end is not None:
             violation = torch.maximum(violation, _open(phases, solution[0].X[:, 0], end))
         return _joined(phases, verdicts, cost, violation)
 
 
 def _open(phases: Phases, first: Tensor, last: Tensor) -> Tensor:
     """By how much a loop isn't closed from the first state (B, n) to the last (B, n'), (B,)."""
-    assert phases.loop is not None
+    assert phases.closing is not None
     n = min(first.shape[-1], last.shape[-1])
-    row = cast(phases.loop.bind(Dimensions(len(first), 1, n, 1, None, None, first)), torch.float64)
+    row = cast(phases.closing.bind(Dimensions(len(first), 1, n, 1, None, None, first)), torch.float64)
     return row.worst(torch.stack((first[:, :n].double(), last[:, :n]), dim=1), last.new_zeros(len(last), 1, 1))
 
 
