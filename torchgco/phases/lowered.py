@@ -224,6 +224,14 @@ class _Dynamics(Dynamics):
             ahead = model.step(x[..., : span.n], u[..., : span.m])
         return pad(ahead, (0, self.n - ahead.shape[-1]))
 
+    def factor_controls(self, k: int) -> slice:
+        """See `in_time.factor_controls`."""
+        i, jumps = self.stretch.of(k)
+        own: Any = self.models[i]
+        if not jumps:
+            return own.factor_controls(k) if hasattr(own, "factor_controls") else slice(0, 0)
+        return slice(self.landings[i].jump.controls, self.landings[i].m)
+
     def at_rest(self, x0: Tensor, N: int) -> Tensor:
         each = ((start, span.N + 1) for start, span in zip(self.starts, self.stretch.phases, strict=True))
         return torch.cat([repeated(pad(start, (0, self.n - start.shape[-1])), count) for start, count in each], dim=1)
