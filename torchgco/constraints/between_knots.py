@@ -191,7 +191,7 @@ def _answered(
 
 
 def _beside(points: Tensor, place: Tensor) -> Tensor:
-    """The last of the points (B, K, P) up to a place (B, K, 1) and the first after it, bool; none where one is missing."""
+    """The last of the points (B, K, P) up to a place (B, K, 1) and the first after it, bool; none without both."""
     up_to = points <= place
     sides = points.masked_fill(~up_to, -torch.inf).argmax(-1), points.masked_fill(up_to, torch.inf).argmin(-1)
     both = up_to.any(-1, keepdim=True) & ~up_to.all(-1, keepdim=True)
