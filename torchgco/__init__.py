@@ -68,12 +68,12 @@ from torchgco.export import LoadedController, export_c, load_c
 from torchgco.fleets import Fleet, FleetSolution
 from torchgco.guesses import Guess
 from torchgco.guidance import GCO, MPPI
-from torchgco.judging.certificate import Certificate, certify
+from torchgco.judging.certificate import Certificate
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres
 from torchgco.phases import Jump, Phases, PhasesSolution
-from torchgco.phases.judging import judge
+from torchgco.phases.judging import certify, judge
 from torchgco.pictures import animate, plot, show
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal

@@ -212,16 +212,14 @@ def _solve_parts(
 ) -> PhasesSolution | FleetSolution:
     if isinstance(parts, Fleet):
         return _solve_fleet(parts, guess | dict(others), solver, seed, ids, max_seconds)
-    expected = "None of phases: they have U0, X0, solver, seed, ids, warm and max_seconds"
-    if given := [name for name, value in others.items() if value is not None]:
+    expected = "None of phases: they have U0, X0, solver, seed, ids, warm, max_seconds and smoothing"
+    if given := [name for name, value in others.items() if value is not None and name != "smoothing"]:
         raise InputError(f"solve.{given[0]}", expected, given[0])
     if guess["warm"] is not None and (guess["U0"], guess["X0"]) != (None, None):
         raise InputError("warm", "None beside U0 and X0", "a solution")
-    if any(map(asks_for_gradients, parts.members)):
-        expected = "tensors without gradients, or a call within torch.no_grad(): solutions of phases have none"
-        raise InputError("phases", expected, "some that ask for them")
     made = _solver("interior_point" if solver is None else solver, parts.members[0], False)
-    return solve_phases(parts, made, **guess, seed=seed, ids=ids, max_seconds=max_seconds, rest=_within_bounds)
+    more = {"seed": seed, "ids": ids, "max_seconds": max_seconds, "smoothing": others["smoothing"]}
+    return solve_phases(parts, made, **guess, **more, rest=_within_bounds)
 
 
 def compare(

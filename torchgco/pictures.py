@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import torch
+
 from torchgco.base.errors import InputError
 from torchgco.fleets import Fleet, FleetSolution
+from torchgco.phases import Phases, PhasesSolution
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
@@ -17,11 +20,16 @@ if TYPE_CHECKING:
     from torchgco.base.html import HtmlPage
 
 
-def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | Sequence[int] | None = None) -> Figure:
+def plot(
+    problem: Problem | Fleet | Phases,
+    solution: Solution | FleetSolution | PhasesSolution,
+    b: int | Sequence[int] | None = None,
+) -> Figure:
     """The scene with the trajectories, then states and controls over time, with their bounds dashed.
 
     Of a fleet a colour for each vehicle, with squares where they start and stars at their goals, then how far each is
-    from the nearest other one.
+    from the nearest other one. Of phases all of them one after the other: in one scene, where they have positions of
+    the same dimension, and over time; components of the same name share a panel, and dotted lines mark the jumps.
 
     In space obstacles are cut at the height, in the side view at the y, that the first trajectory has there; crosses
     mark contact, between the knots too. Bounds far from all values are left out. A notebook shows the figure;
@@ -37,10 +45,26 @@ def plot(problem: Problem | Fleet, solution: Solution | FleetSolution, b: int | 
     """
     if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
         return _fleet_figure(problem, solution, b)
+    if isinstance(problem, Phases) or isinstance(solution, PhasesSolution):
+        return _phases_figure(problem, solution, b)
     problem = current_problem(problem)
     from torchgco.plotting.problems import solution_figure  # matplotlib takes a second to load
 
     return solution_figure(problem, solution.detach(), b)
+
+
+def _phases_figure(phases: Any, solution: Any, b: Any) -> Figure:
+    from torchgco.plotting.problems import phases_figure  # matplotlib takes a second to load
+
+    if not isinstance(phases, Phases) or not isinstance(solution, PhasesSolution) or len(solution) != len(phases):
+        raise InputError("solution", "phases and their solution", type(solution).__name__)
+    solution = solution.detach()
+    try:
+        begins = solution.begins
+    except InputError:  # models without a time step: knots are counted
+        counts = torch.tensor([0, *(one.N for one in solution.problems)]).cumsum(0)
+        begins = counts.expand(phases.B, -1)
+    return phases_figure(solution.problems, solution.parts, begins.cpu().numpy(), solution.cost.cpu().numpy(), b)
 
 
 def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:

@@ -33,7 +33,7 @@ from torchgco import (
 )
 
 INSTANTS = 1000  # of each stage
-ROUNDS = 3
+ROUNDS = 5
 HEAD = (
     "rows", "stages", "converged", "knots alone", "three points", *(f"round {i + 1}" for i in range(ROUNDS)),
     "cost more, %", "time", "first three points",

@@ -413,4 +413,4 @@ def test_what_is_made_of_torchgcos_own_parts_stays_while_their_numbers_do(monkey
     users = boat()
     torchgco.solve(users)
     torchgco.solve(users)
-    assert len(sought) == 4
+    assert len(sought) == 3

@@ -62,6 +62,11 @@ def is_recording() -> bool:
 
 def leaves(tree: Any) -> list[Any]:
     """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
+    return [node for node in nodes(tree) if not _holds(type(node))]
+
+
+def nodes(tree: Any) -> list[Any]:
+    """Nested sequences, mappings and dataclasses, and all that they hold."""
     flat: list[Any] = []
     waiting, seen = [tree], set[int]()
     while waiting:
@@ -70,6 +75,7 @@ def leaves(tree: Any) -> list[Any]:
             flat.append(node)
         elif id(node) not in seen:  # parts may hold each other
             seen.add(id(node))
+            flat.append(node)
             held = node if isinstance(node, (Mapping, tuple, list)) else getattr(node, "__dict__", {})
             waiting += held.values() if isinstance(held, Mapping) else held
     return flat

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 from weakref import WeakKeyDictionary
 
 import torch
@@ -165,18 +165,22 @@ class _All(frozenset):
 
 def keywords(function: Callable[..., Any]) -> frozenset[str]:
     """The arguments that a function takes by name; all of them where it takes **anything."""
-    parameters = _parameters(function)
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return _All()
-    return frozenset(p.name for p in parameters if p.kind in NAMED_PARAMETERS)
+    return _taken(function).names
 
 
 def asks_for_knot(function: Callable[..., Any]) -> bool:
     """Whether a function has an argument k without a default; with one, k is a constant of the user's."""
-    return any(p.name == "k" and p.kind in NAMED_PARAMETERS and p.default is p.empty for p in _parameters(function))
+    return _taken(function).knot
 
 
-def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:
+class _Taken(NamedTuple):
+    """What a function takes by name, and whether it asks for a knot k."""
+
+    names: frozenset[str]
+    knot: bool
+
+
+def _taken(function: Callable[..., Any]) -> _Taken:
     with suppress(KeyError, TypeError):  # not seen before, or it can't be a key
         return _known[function]
     called = function.forward if isinstance(function, torch.nn.Module) else function
@@ -184,10 +188,14 @@ def _parameters(function: Callable[..., Any]) -> tuple[inspect.Parameter, ...]:
         parameters = tuple(inspect.signature(called).parameters.values())
     except (TypeError, ValueError):  # a builtin without a signature
         parameters = ()
+    named = [p for p in parameters if p.kind in NAMED_PARAMETERS]
+    every = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters)
+    names = _All() if every else frozenset(p.name for p in named)
+    taken = _Taken(names, any(p.name == "k" and p.default is p.empty for p in named))
     with suppress(TypeError):
-        _known[function] = parameters
-    return parameters
+        _known[function] = taken
+    return taken
 
 
 # A rollout by PyTorch's kernels asks at every knot; what a function captures must not outlive it for that.
-_known: WeakKeyDictionary[Callable[..., Any], tuple[inspect.Parameter, ...]] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Callable[..., Any], _Taken] = WeakKeyDictionary()

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions
@@ -15,10 +16,11 @@ from torchgco.constraints.base import Constraint
 from torchgco.dynamics.integrators import INTEGRATORS
 
 MOST_POINTS = 32  # of a stage: each has rows of its own
-# Where rows are measured between two neighbours among a stage's points, as shares of the gap: a peak anywhere from
-# 1/256 of it on is seen to at least 83 %, as its distance from a knot is known to a factor of sqrt(2).
-_HALVES = [2.0**-i for i in range(8, 0, -1)]
-IN_A_GAP = (*_HALVES, *(1.0 - share for share in reversed(_HALVES[:-1])))
+# Instants at which rows of a stage are measured, its ends included, closer to these. A parabola through three of them
+# finds a peak so well that a row there, whose slope is 0, is off by 1e-4 of what the row bends within a stage.
+INSTANTS = 65
+NUMBERS_AT_ONCE = 2**20  # of states at several instants: 8 MB
+PUSHES = 0.1  # share of a row's largest multiplier in a stage from which a point holds the trajectory: others are idle
 MORE = 1.05  # of an excess: the next trajectory bends a little more
 
 
@@ -46,11 +48,12 @@ class BetweenKnots(Constraint):
     points: int = 3
     model: Any = field(default=None, repr=False, kw_only=True)  # the problem's, once bound, as what follows
     stages: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,)
+    shares: Any = field(default=None, repr=False, kw_only=True)  # (B, N, points), once tightened: of each stage
     margins: Any = field(default=None, repr=False, kw_only=True)  # (B, K, points, p), once tightened
     counted: Any = field(default=None, repr=False, kw_only=True)  # int64 (K,): which of the constraint's knots end them
     factor: int | None = field(default=None, repr=False, kw_only=True)  # the state that is the factor of free time
 
-    batched: ClassVar[tuple[str, ...]] = ("constraint", "model", "margins")
+    batched: ClassVar[tuple[str, ...]] = ("constraint", "model", "shares", "margins")
     on_its_way: ClassVar[bool] = True
     calls_function = property(lambda self: is_users(self.constraint) or is_users(self.model))
 
@@ -84,42 +87,71 @@ class BetweenKnots(Constraint):
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         """c (B, K, points p) of the stages, a point after the other."""
-        shares = [i / (self.points + 1) for i in range(1, self.points + 1)]
-        rows = torch.stack([self._rows(X, U, share) for share in shares], -2)
+        places = self._even if self.shares is None else self.shares.unbind(-1)
+        rows = torch.stack([self._rows(X, U, share) for share in places], -2)
         return (rows if self.margins is None else rows + self.margins).flatten(-2)
 
-    def _rows(self, X: Tensor, U: Tensor, share: float) -> Tensor:
-        """c (B, K, p) after this share of each stage."""
+    @property
+    def _even(self) -> list[float]:
+        """Shares of a stage that are apart by the same."""
+        return [i / (self.points + 1) for i in range(1, self.points + 1)]
+
+    def _rows(self, X: Tensor, U: Tensor, share: float | Tensor) -> Tensor:
+        """c (B, K, p) after this share of each stage, one of all or (B, N)."""
         n, m = self.model.n, self.model.m
         model, u = self.model.at(torch.arange(U.shape[1], device=X.device)), U[..., :m]
         rates = lambda x: model.field(x, u)
         if self.factor is not None:
             tau = X[:, :-1, self.factor : self.factor + 1]
             rates = lambda x: tau * model.field(model.settled(x), u)
-        x = INTEGRATORS[model.integrator](rates, X[:, :-1, :n], model.dt * share)
+        length, own = model.dt * share, rates
+        if isinstance(share, Tensor):  # integrators take one time step for all states
+            length, own = model.dt, lambda x: share.unsqueeze(-1) * rates(x)
+        x = INTEGRATORS[model.integrator](own, X[:, :-1, :n], length)
         within = (x, X[:, -1:, :n]) if _of_stages(self.constraint) else (X[:, :1, :n], x)
         return self.constraint.value(torch.cat(within, 1), u)[:, self.counted]
 
-    def tightened(self, lowered: Self, X: Tensor, U: Tensor) -> Self:
-        """The same rows, kept further at points beside a gap in which one is violated, by as much as in that gap.
+    def tightened(self, lowered: Self, X: Tensor, U: Tensor, lam: Tensor) -> Self:
+        """The same rows, kept further, or at other instants, where one is violated between its points.
 
-        A gap that begins or ends at a knot has one such point, and the row is held at the knot: nearer to it, the row
-        has to fall further at the point.
+        Between two points that both push, the row is kept further at both, by the excess: the trajectory lies on them.
+        Beside one alone a peak would flee to its other side: there the least of the stage's points moves to the peak,
+        and the next one is between two (an exchange method of semi-infinite programming).
 
         Args:
             lowered: this in the form of X (B, N+1, n) and U (B, N, m).
+            lam: multipliers (B, K, points p).
         """
-        gaps, levers = self.points + 1, torch.tensor(IN_A_GAP, dtype=X.dtype, device=X.device)
-        at = lambda gap, share=0.0: lowered._rows(X, U, (gap + share) / gaps)
-        now = torch.stack([at(gap) for gap in range(1, gaps)], 2)  # (B, K, points, p)
-        inner = torch.stack([torch.stack([at(gap, share) for share in IN_A_GAP], -1) for gap in range(gaps)], 2)
-        excess, place = inner.max(-1)  # (B, K, gaps, p)
-        lever = torch.ones_like(excess)  # how far a row falls there where it falls by 1 at the points of its gap
-        lever[:, :, 0], lever[:, :, -1] = levers[place[:, :, 0]], 1.0 - levers[place[:, :, -1]]
-        excess = excess.clamp(min=0.0) / lever
-        falls = torch.maximum(excess[:, :, :-1], excess[:, :, 1:])
-        before = torch.zeros_like(now) if self.margins is None else self.margins
-        return replace(self, margins=torch.where(falls > 0, MORE * falls - now, before).clamp(min=0.0))
+        shape = *U.shape[:2], self.points
+        shares = X.new_tensor(self._even).expand(shape) if self.shares is None else self.shares
+        now = torch.stack([lowered._rows(X, U, share) for share in shares.unbind(-1)], 2)  # (B, K, points, p)
+        margins = torch.zeros_like(now) if self.margins is None else self.margins
+        rows = now, lam.unflatten(-1, (self.points, -1))
+        points, margins = _answered(shares[:, self.stages], margins, *rows, *lowered._peaks(X, U))
+        shares = shares.clone()
+        shares[:, self.stages] = points
+        return replace(self, shares=shares, margins=margins)
+
+    def _peaks(self, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
+        """The heights of each row's peaks within stages, minus infinity where there is none, and their shares,
+        (B, K, p instants) both."""
+        angles = torch.linspace(0.0, torch.pi, INSTANTS, dtype=X.dtype, device=X.device)
+        shares = lambda angle: 0.5 - 0.5 * angle.cos()
+        at_once = max(1, NUMBERS_AT_ONCE // max(1, X.numel()))
+        c = torch.cat([self._at_all(X, U, shares(some)) for some in angles.split(at_once)], 1).movedim(1, -1)
+        low, mid, high = c[..., :-2], c[..., 1:-1], c[..., 2:]  # (B, K, p, instants)
+        bend = low - 2.0 * mid + high
+        off = torch.where(bend < 0, 0.5 * (low - high) / bend, 0.0).clamp(-1.0, 1.0)
+        peak = (mid >= low) & (mid > high)
+        height = torch.where(peak, mid - 0.25 * (low - high) * off, -torch.inf)
+        return height, shares(angles[1:-1] + off * (angles[1] - angles[0]))
+
+    def _at_all(self, X: Tensor, U: Tensor, shares: Tensor) -> Tensor:
+        """c (B, S, K, p) after each of these shares (S,) of all stages."""
+        B, S = len(X), len(shares)
+        each = torch.arange(B, device=X.device).repeat_interleave(S)
+        lengths = shares.repeat(B).unsqueeze(-1).expand(-1, U.shape[1])
+        return self.take(each)._rows(X[each], U[each], lengths).unflatten(0, (B, S))
 
     def in_free_time(self, n: int, m: int, later: int) -> Constraint:
         return replace(self, factor=n)
@@ -131,3 +163,36 @@ class BetweenKnots(Constraint):
 def _of_stages(constraint: Any) -> bool:
     """Whether rows are of a stage's controls, too: their knots are those where stages begin."""
     return getattr(constraint, "of", "x") == "xu"
+
+
+def _answered(
+    shares: Tensor, margins: Tensor, now: Tensor, lam: Tensor, heights: Tensor, places: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Shares (B, K, P) and margins (B, K, P, p) of points that answer peaks above 0, as many as there are points.
+
+    Args:
+        now: the rows at the points, (B, K, P, p).
+        lam: their multipliers.
+        heights, places: of each row's peaks, (B, K, p, q).
+    """
+    before, (*_, P, p) = shares, now.shape
+    pushes, idle = lam > PUSHES * lam.amax(2, keepdim=True), lam.sum(-1)
+    highest, index = heights.flatten(2).topk(P, dim=-1)
+    for height, chosen in zip(highest.split(1, -1), index.split(1, -1), strict=True):
+        place, row = places.flatten(2).gather(-1, chosen), one_hot(chosen // heights.shape[-1], p).bool()
+        beside = _beside(before, place)
+        held = beside.any(-1, keepdim=True) & ~(beside & ~(pushes & row).any(-1)).any(-1, keepdim=True)
+        further = torch.maximum(margins, MORE * height.unsqueeze(-1) - now)
+        margins = torch.where((beside & held & (height > 0)).unsqueeze(-1) & row, further, margins)
+        moves = one_hot(idle.argmin(-1), P).bool() & (height > 0) & ~held
+        shares, margins = torch.where(moves, place, shares), torch.where(moves.unsqueeze(-1), 0.0, margins)
+        idle = idle.masked_fill(moves, torch.inf)
+    return shares, margins
+
+
+def _beside(points: Tensor, place: Tensor) -> Tensor:
+    """The last of the points (B, K, P) up to a place (B, K, 1) and the first after it, bool; none without both."""
+    up_to = points <= place
+    sides = points.masked_fill(~up_to, -torch.inf).argmax(-1), points.masked_fill(up_to, torch.inf).argmin(-1)
+    both = up_to.any(-1, keepdim=True) & ~up_to.all(-1, keepdim=True)
+    return one_hot(torch.stack(sides, -1), points.shape[-1]).bool().any(-2) & both

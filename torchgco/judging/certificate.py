@@ -71,32 +71,7 @@ def certify(
     multipliers: Sequence[Tensor] | None = None,
     times: Tensor | None = None,
 ) -> Certificate:
-    """Certify trajectories X (B, N+1, n), U (B, N, m).
-
-    The clearance includes collisions between knots that are both outside an obstacle. With Euler steps, positions and
-    obstacles move straight from knot to knot, so distances are exact (for boxes: lower bounds within 1e-9). For
-    midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration; this is subtracted.
-    The acceleration is sampled at both ends of the interval and at the half step, and the largest difference between
-    samples is added: this is a bound only if the acceleration varies by no more than that between them. Steps without a
-    known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; distances are
-    then those of the chord. Geometric constraints other than obstacles count at their knots only, as violations.
-
-    Rows that may have a fitted multiplier are equalities, and inequalities with a slack of at most 1e-3 (m for
-    obstacles). A test to many digits needs multipliers that are given: those of an interior point push a little from
-    far rows, too.
-
-    Args:
-        problem: the planning problems; those in float32 are certified in float64, with their numbers as they are.
-        X, U: the trajectories that a solver returned, float64 or float32.
-        asked: (B,) bool, the problems to certify; NaN for the others. None: all.
-        multipliers: (B, K, p) of each constraint, such as `solution.multipliers.lam`; wherever they come from, they are
-            tested. Below 0 they count as 0, but for equalities. None: fitted.
-        times: (B, N+1), s, of the knots where the time is free, such as `solution.t`. The KKT residual then is with
-            respect to the factors of time, too; multipliers of their bounds are those that fit best.
-
-    Raises:
-        InputError: X, U, asked or multipliers don't fit the problem.
-    """
+    """See `torchgco.certify`."""
     problem = current_problem(problem)
     problem, X, U = row_by_row(in_double(problem)), doubled(X, "X", problem), doubled(U, "U", problem)
     problem.check_controls(U, "U")
@@ -331,11 +306,12 @@ def _reduced(
     x, u = X[:, :-1].repeat(n, 1, 1), U.repeat(n, 1, 1)
     fx, fu = gradients(lambda x, u: twins.step(x, u).diagonal(dim1=0, dim2=2), x, u)  # (n, N, n), (n, N, m)
     total, terms, of_start = torch.empty_like(gU), torch.empty_like(gU[0]), torch.empty_like(gX[0, 0])
-    adjoint, chosen = gX[:, N], factor_controls(problem)
+    adjoint = gX[:, N]
     for k in range(N - 1, -1, -1):
         total[:, k] = gU[:, k] + adjoint @ fu[:, k]
         terms[k] = gU[0, k].abs() + adjoint[0].abs() @ fu[:, k].abs()
         if k < N - 1:  # a next factor of time is nothing but a state: what cancels, cancels in that
+            chosen = factor_controls(problem, k)
             terms[k, chosen] = of_start @ fu[:, k, chosen].abs()
         of_start = gX[0, k].abs() + adjoint[0].abs() @ fx[:, k].abs()
         adjoint = gX[:, k] + adjoint @ fx[:, k]

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.gradients import is_forward, leaves
+from torchgco.base.gradients import is_forward, nodes
 from torchgco.base.memory import trim
-from torchgco.base.tree import is_users
+from torchgco.base.tree import PerElement, is_users
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
@@ -53,14 +53,14 @@ def current(problem: Problem) -> Problem:
     """The problem as its parts are now: nothing is kept from an earlier solve but what can't have changed since.
 
     Every solve begins with this call: the tensors, numbers and modules that a user's code captures may have changed,
-    and then code of the same computation alone is kept. Of torchgco's own parts everything stays that was made of them
-    while their numbers do: forms, scales, structures that C reads. Within a solve, subsets and other forms of the
-    problem share the kernels of its beginning.
+    and then code of the same computation alone is kept. While neither they nor the problem's own numbers have changed,
+    all stays that was made of them: forms, scales, structures that C reads. Within a solve, subsets and other forms of
+    the problem share the kernels of its beginning.
     """
     if problem.known.current:
         return problem
     facts, (then, before) = _standing(problem), problem.derived.get(CURRENT, (None, problem))
-    if facts is not None and facts == then and before.known.in_c is not False:
+    if facts is not None and facts == then and before.known.in_c is not False and _has_code(before):
         return before
     fresh = problem.renewed()
     fresh.known.current, fresh.known.warned = True, problem.known.warned
@@ -81,13 +81,28 @@ def _standing(problem: Problem) -> tuple[Hashable, ...] | None:
 
 
 def _own_tensors(problem: Problem) -> tuple[Tensor, ...] | None:
-    """All tensors of a problem; None where a part is a user's, or one is of inference mode, which counts no writes."""
-    parts = problem.dynamics, problem.cost, *problem.constraints
-    if any(map(is_users, parts)):
-        return None
-    every = leaves((parts, problem.x0, problem.goal, problem.horizon, problem.free_start, problem.time))
-    own = [leaf for leaf in every if isinstance(leaf, Tensor)]
-    return None if any(tensor.is_inference() for tensor in own) else tuple(own)
+    """All tensors of a problem; None where a part is of a user's class, which may hold others, or one is of inference
+    mode, which counts no writes."""
+    parts = problem.dynamics, problem.cost, problem.constraints
+    every = nodes((parts, problem.x0, problem.goal, problem.horizon, problem.free_start, problem.time))
+    own = [node for node in every if isinstance(node, Tensor)]
+    foreign = (isinstance(node, PerElement) and not type(node).__module__.startswith("torchgco.") for node in every)
+    return None if any(foreign) or any(tensor.is_inference() for tensor in own) else tuple(own)
+
+
+def _has_code(problem: Problem) -> bool:
+    """Whether functions in the problem's parts, if any, do what they did when its kernels were made, and capture the
+    same numbers."""
+    known = problem.known
+    if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
+        return True
+    if known.code is None or not known.in_c:
+        return False
+    engine, now = known.in_c.engine, signature(problem)
+    if now is None or now.key != known.code.key or not known.code.facts.hold:
+        return False
+    captured = engine.captured.read()
+    return captured is not None and captured.is_same(engine.shared)
 
 
 def kernels_of(problem: Problem) -> Kernels:
@@ -161,6 +176,7 @@ def expect_interior(problem: Problem) -> None:
 def _engine(problem: Problem) -> Engine:
     """The engine of an earlier solve where nothing that its code depends on has changed, else a new one."""
     before, expects = signature(problem), problem.known.expects_interior
+    problem.known.code = None
     ahead = begin_interior if expects else None
     if before is None:
         return Engine(problem, ahead)
@@ -168,6 +184,7 @@ def _engine(problem: Problem) -> Engine:
     known = _engines.pop(key, None)
     if known is not None and known[1].hold and (shared := known[0].captured.read()) is not None:
         _engines[key] = known  # the most recent one is the last
+        problem.known.code = before
         engine = known[0].with_shared(shared.copy())
         engine.serve(problem.B, ahead)
         return engine
@@ -176,6 +193,7 @@ def _engine(problem: Problem) -> Engine:
     if after is not None and after.key == before.key and after.covers(engine.captured.traces):
         engine.forget_values()
         _engines[key] = engine, after.facts
+        problem.known.code = after
         trim(_engines, ENGINES_KEPT, CAPTURED, lambda kept: kept[0].captured.nbytes)
     return engine.with_shared(engine.shared.copy())  # a compiled problem writes into it
 

@@ -1,4 +1,4 @@
-"""`torchgco.judge`, of problems, fleets and phases."""
+"""`torchgco.judge` and `certify`, of problems, fleets and phases."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from torchgco.base.errors import InputError, shown
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.solution import FleetSolution
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet
+from torchgco.judging import certificate
 from torchgco.judging import judge as judging
+from torchgco.judging.certificate import Certificate
 from torchgco.judging.judge import Verdict
 from torchgco.phases.phases import Phases
 from torchgco.phases.solution import PhasesSolution
-from torchgco.phases.verdict import PhasesVerdict, judge_phases
+from torchgco.phases.verdict import PhasesVerdict, certify_phases, judge_phases
 from torchgco.problem.problem import Problem
 
 
@@ -75,3 +77,61 @@ def judge(
     if isinstance(controls, Tensor) or not isinstance(controls, Sequence) or len(controls) != problem.V:
         raise InputError("U", f"a FleetSolution, or controls (B, N, m) of each of {problem.V} vehicles", shown(U))
     return judge_fleet(problem, controls)
+
+
+@overload
+def certify(
+    problem: Problem,
+    X: Tensor,
+    U: Tensor,
+    asked: Tensor | None = None,
+    multipliers: Sequence[Tensor] | None = None,
+    times: Tensor | None = None,
+) -> Certificate: ...
+@overload
+def certify(problem: Phases, X: PhasesSolution, *, asked: Tensor | None = None) -> Certificate: ...
+
+
+def certify(
+    problem: Problem | Phases,
+    X: Tensor | PhasesSolution,
+    U: Tensor | None = None,
+    asked: Tensor | None = None,
+    multipliers: Sequence[Tensor] | None = None,
+    times: Tensor | None = None,
+) -> Certificate:
+    """Certify trajectories X (B, N+1, n), U (B, N, m); or all phases and jumps of a solution as one problem.
+
+    The clearance includes collisions between knots that are both outside an obstacle. With Euler steps, positions and
+    obstacles move straight from knot to knot, so distances are exact (for boxes: lower bounds within 1e-9). For
+    midpoint and rk4 the path leaves the chord by at most dt^2 / 8 times the largest acceleration; this is subtracted.
+    The acceleration is sampled at both ends of the interval and at the half step, and the largest difference between
+    samples is added: this is a bound only if the acceleration varies by no more than that between them. Steps without a
+    known field (`integrator="none"`, a class that overrides `step` alone) have no path between knots; distances are
+    then those of the chord. Geometric constraints other than obstacles count at their knots only, as violations.
+
+    Rows that may have a fitted multiplier are equalities, and inequalities with a slack of at most 1e-3 (m for
+    obstacles). A test to many digits needs multipliers that are given: those of an interior point push a little from
+    far rows, too.
+
+    Args:
+        problem: the planning problems; those in float32 are certified in float64, with their numbers as they are. Or
+            phases, of whose step costs nothing is said.
+        X, U: the trajectories that a solver returned, float64 or float32; of phases their solution alone, with whose
+            multipliers they are tested.
+        asked: (B,) bool, the problems to certify; NaN for the others. None: all.
+        multipliers: (B, K, p) of each constraint, such as `solution.multipliers.lam`; wherever they come from, they are
+            tested. Below 0 they count as 0, but for equalities. None: fitted.
+        times: (B, N+1), s, of the knots where the time is free, such as `solution.t`. The KKT residual then is with
+            respect to the factors of time, too; multipliers of their bounds are those that fit best.
+
+    Raises:
+        InputError: X, U, asked or multipliers don't fit the problem.
+    """
+    if not isinstance(problem, Phases):
+        trajectory: tuple[Any, Any] = X, U
+        return certificate.certify(problem, *trajectory, asked, multipliers, times)
+    for name, value in (("U", U), ("multipliers", multipliers), ("times", times)):
+        if value is not None:
+            raise InputError(f"certify.{name}", "None of phases, whose solution says all", shown(value))
+    return certify_phases(problem, X, asked)

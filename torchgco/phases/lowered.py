@@ -7,16 +7,15 @@ jump's stage are the jump's, then the time of the next phase, where that is free
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from copy import copy
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from operator import is_
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, inf
 from torch.nn.functional import pad
 
+from torchgco.base.gradients import recording
 from torchgco.base.shapes import Dimensions, repeated
 from torchgco.base.tree import PerElement, is_users
 from torchgco.constraints.base import Constraint, WrappedConstraint
@@ -26,7 +25,6 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.phases.jump import Jump
 from torchgco.phases.phases import Phases
 from torchgco.problem.horizons import for_solvers
-from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
 
 IDLE = 0.5  # cost of a control that a stage lacks, per unit squared: it makes the minimum, at 0, strict
@@ -78,15 +76,15 @@ class Whole:
     """Phases as one problem.
 
     Attributes:
-        members: the problem of each phase, with its numbers as they are now.
+        members: the problem of each phase.
         forms: the same as solvers see them.
         landings: the jumps.
         spans: of the phases; of the jumps `spans_between`.
-        problem: all of it, of which nothing is known yet.
+        problem: all of it.
     """
 
     def __init__(self, phases: Phases) -> None:
-        self.phases, self.members = phases, tuple(one.current() for one in phases.members)
+        self.phases, self.members = phases, phases.members
         self.forms = tuple(for_solvers(one) for one in self.members)
         self.landings = tuple(
             Landing(jump, one.time is not None, form.x0[:, one.n + (one.time is not None) :])
@@ -101,14 +99,6 @@ class Whole:
             for span, landing in zip(self.spans, self.landings, strict=False)
         )
         self.problem = self._problem()
-
-    @classmethod
-    def current(cls, phases: Phases, before: Whole | None) -> Whole:
-        """Phases with their numbers as they are now, to be solved; of the whole `before` what can't have changed."""
-        members = (one.current() for one in phases.members)
-        whole = copy(before) if before is not None and all(map(is_, members, before.members)) else cls(phases)
-        whole.problem = whole.problem._with({}, Known(current=True))
-        return whole
 
     def _problem(self) -> Problem:
         first, N = self.forms[0], self.spans[-1].first + self.spans[-1].N
@@ -127,7 +117,9 @@ class Whole:
             "constraints": tuple(self._rows(stretch)),
             "goal": None, "horizon": None, "time": None,
         }  # fmt: skip
-        return first._with(parts)
+        whole = first._with(parts)
+        whole._set(given=_Given(self.phases))
+        return whole
 
     def _rows(self, stretch: Stretch) -> Iterator[Constraint]:
         for form, span in zip(self.forms, self.spans, strict=True):
@@ -136,15 +128,37 @@ class Whole:
         for landing, jump, span in zip(self.landings, self.phases.between, self.spans_between, strict=True):
             for row in jump.constraints:
                 yield _shifted(row, replace(span, n=landing.jump.n, m=jump.controls), stretch)
-        if self.phases.loop is not None:
+        if self.phases.closing is not None:
             x0 = self.members[0].x0
             dims = Dimensions(len(x0), stretch.N, self._common, stretch.m, None, None, x0)
-            yield self.phases.loop.bind(dims)
+            yield self.phases.closing.bind(dims)
 
     @property
     def _common(self) -> int:
         """How many states the first phase and the last one have in common."""
         return min(self.members[0].n, self.members[-1].n)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What the problem of all phases was made of, as `problem.given` tells it."""
+
+    phases: Phases
+
+    asks = property(lambda self: self.phases.asks)
+
+    def current(self, problem: Problem) -> Problem:
+        """The problem: phases are looked at when it is made of them."""
+        return problem
+
+    def recorded(self, problem: Problem) -> Problem:
+        """The same with gradients recorded."""
+        live = self.phases.recorded()
+        with recording():
+            return Whole(live).problem
+
+    def followed(self, whole: Problem, by: Callable[[Problem], Problem]) -> None:
+        """Nothing of what is made of it."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +223,14 @@ class _Dynamics(Dynamics):
             model = self.models[i].at(torch.arange(span.N, device=x.device) if k is None else k - span.first)
             ahead = model.step(x[..., : span.n], u[..., : span.m])
         return pad(ahead, (0, self.n - ahead.shape[-1]))
+
+    def factor_controls(self, k: int) -> slice:
+        """See `in_time.factor_controls`."""
+        i, jumps = self.stretch.of(k)
+        own: Any = self.models[i]
+        if not jumps:
+            return own.factor_controls(k) if hasattr(own, "factor_controls") else slice(0, 0)
+        return slice(self.landings[i].jump.controls, self.landings[i].m)
 
     def at_rest(self, x0: Tensor, N: int) -> Tensor:
         each = ((start, span.N + 1) for start, span in zip(self.starts, self.stretch.phases, strict=True))

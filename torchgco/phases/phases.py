@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+from operator import is_
 from typing import Any
 
 from torchgco.base.errors import InputError, shown
+from torchgco.base.gradients import asking, recording, without_gradients
 from torchgco.constraints.link import Link
 from torchgco.costs.base import Cost
 from torchgco.phases.jump import Jump, linked
+from torchgco.problem.given import facts_of
 from torchgco.problem.problem import Problem
+
+RENEWED = "renewed"  # what phases keep: the ones of other numbers that were made last
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,9 @@ class Phases:
     loop: Link | None = None
     members: tuple[Problem, ...] = field(init=False, repr=False)
     between: tuple[Jump, ...] = field(init=False, repr=False)  # bound, one fewer
+    closing: Link | None = field(init=False, repr=False)  # the loop's numbers without gradients, as those of all else
     derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
+    facts: tuple[Hashable, ...] = field(init=False, repr=False, compare=False)  # of the numbers of jumps
 
     def __post_init__(self) -> None:
         if not isinstance(self.problems, Sequence) or not all(isinstance(one, Problem) for one in self.problems):
@@ -52,11 +60,16 @@ class Phases:
         for i, one in enumerate(self.problems):
             _check(one, self.problems[0], i)
         object.__setattr__(self, "members", tuple(self.problems))
-        object.__setattr__(self, "between", _between(self.jumps, self.members))
+        object.__setattr__(self, "facts", self._facts())
+        self._bind(without_gradients(self.jumps), without_gradients(self.loop))
         if not isinstance(self.loop, Link | None):
             raise InputError("phases.loop", "a Link, or None", shown(self.loop))
-        if self.loop is not None:
-            linked(self.loop, self.members[-1], self.members[0], "phases.loop")
+        if self.closing is not None:
+            linked(self.closing, self.members[-1], self.members[0], "phases.loop")
+
+    def _bind(self, jumps: Any, loop: Link | None) -> None:
+        object.__setattr__(self, "between", _between(jumps, self.members))
+        object.__setattr__(self, "closing", loop)
 
     def __len__(self) -> int:
         return len(self.members)
@@ -65,6 +78,32 @@ class Phases:
     def B(self) -> int:
         """How many problems of phases."""
         return self.members[0].B
+
+    def current(self) -> Phases:
+        """The same phases with numbers as they are now, where these were changed in place since; else these."""
+        members, facts = tuple(one.current() for one in self.members), self._facts()
+        for made in (self, self.derived.get(RENEWED, self)):
+            if facts == made.facts and all(map(is_, members, made.members)):
+                return made
+        self.derived[RENEWED] = renewed = replace(self, problems=members)
+        return renewed
+
+    @property
+    def asks(self) -> bool:
+        """Whether tensors in phases or jumps ask for gradients."""
+        given = (one.given for one in self.members)
+        return any(one is not None and one.asks for one in given) or bool(asking((self.jumps, self.loop)))
+
+    def recorded(self) -> Phases:
+        """The same phases with gradients recorded, from the tensors that were given on."""
+        live = copy(self)
+        with recording():
+            object.__setattr__(live, "members", tuple(one.recorded() for one in self.members))
+            live._bind(self.jumps, self.loop)
+        return live
+
+    def _facts(self) -> tuple[Hashable, ...]:
+        return tuple(facts_of((self.jumps, self.loop)))
 
 
 def _kind(one: Problem) -> tuple[Any, ...]:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchgco.base.gradients import recording
 from torchgco.base.status import Status
 from torchgco.base.tree import passed_on
 from torchgco.explaining.account import Account
@@ -34,9 +35,10 @@ class PhasesSolution:
     whole: Whole
     found: Solution  # of the problem that solvers were given
     solver: Any
+    live: Whole | None = None  # with gradients recorded, where the solution leads to tensors that ask for them
 
-    cost, violation, status, iterations, statuses = passed_on(
-        "found", "cost", "violation", "status", "iterations", "statuses"
+    cost, violation, status, iterations, statuses, differentiable, why_not = passed_on(
+        "found", "cost", "violation", "status", "iterations", "statuses", "differentiable", "why_not"
     )  # (B,) of all phases and jumps: the sum, the largest, metres for lengths, see Status
 
     @property
@@ -52,7 +54,8 @@ class PhasesSolution:
     def problems(self) -> tuple[Problem, ...]:
         """The phases' problems, each with its start that was found: for `plot`, `certify` and tables of one."""
         first, *others = self.whole.members
-        starts = (self.found.X[:, span.first, : span.n] for span in self.whole.spans[1:])
+        X = self.found.X.detach()
+        starts = (X[:, span.first, : span.n] for span in self.whole.spans[1:])
         pairs = zip(others, starts, strict=True)
         return first, *(one._with({"x0": x[:, : one.n].contiguous()}, one.known) for one, x in pairs)
 
@@ -69,13 +72,32 @@ class PhasesSolution:
         first, n, m = sum(len(one.constraints) for one in whole.forms[:i]), member.n, member.m
         lam = tuple(found.multipliers.lam[first : first + len(member.constraints)])
         times = None if member.time is None else times_of(member, factors_in(member, X))
+        worst = violation(form.constraints, X.detach(), U.detach())
         return replace(
-            found, X=X[..., :n].contiguous(), U=U[..., :m].contiguous(), cost=form.cost.total(X, U),
+            found, X=X[..., :n].contiguous(), U=U[..., :m].contiguous(), cost=self._cost(i, X, U),
             K=found.K[:, span.stages, :m, :n].contiguous(), d=found.d[:, span.stages, :m].contiguous(),
-            multipliers=Multipliers(lam, found.multipliers.mu), violation=violation(form.constraints, X, U),
+            multipliers=Multipliers(lam, found.multipliers.mu), violation=worst,
             times=times, trace=None, search=None,
             account=Account(self.problems[i], self.solver, kernels=found.account and found.account.kernels),
         )  # fmt: skip
+
+    def _cost(self, i: int, X: Tensor, U: Tensor) -> Tensor:
+        """The cost (B,) of phase i."""
+        if self.live is None:
+            return self.whole.forms[i].cost.total(X, U)
+        with recording():
+            cost = self.live.forms[i].cost.total(X, U)
+        return torch.where(self.differentiable, cost, cost.detach())
+
+    def leading_to(self, found: Solution) -> PhasesSolution:
+        """The same with `found`, which has gradients."""
+        phases = self.phases.recorded()
+        with recording():
+            return replace(self, found=found, live=Whole(phases))
+
+    def detach(self) -> PhasesSolution:
+        """The same numbers without gradients."""
+        return replace(self, found=self.found.detach(), live=None)
 
     def __len__(self) -> int:
         return len(self.phases)

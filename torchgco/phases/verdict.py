@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import torch
@@ -13,7 +14,9 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import Dimensions, computing_on
 from torchgco.base.tree import cast
 from torchgco.constraints.base import ADMITTED
+from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.judge import Verdict, doubled, in_double, judge
+from torchgco.phases.lowered import Whole
 from torchgco.phases.phases import Phases
 from torchgco.phases.solution import PhasesSolution
 from torchgco.problem.in_time import at_times
@@ -45,13 +48,12 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
     Raises:
         InputError: a solution of other phases.
     """
-    if not isinstance(solution, PhasesSolution) or len(solution) != len(phases):
-        raise InputError("solution", f"a PhasesSolution of {len(phases)} phases", shown(solution))
+    _check(phases, solution)
     with computing_on(phases.members[0].x0.device):
-        verdicts, start, end = list[Verdict](), None, None
+        phases, verdicts, start, end = phases.current(), list[Verdict](), None, None
         cost = violation = torch.zeros_like(solution.cost, dtype=torch.float64)
         for i, (member, part) in enumerate(zip(phases.members, solution.parts, strict=True)):
-            member = in_double(member.current())
+            member = in_double(member)
             U = doubled(part.U, "U", member)
             times = None if part.times is None else doubled(part.times, "times", member)
             if start is not None:
@@ -63,16 +65,41 @@ def judge_phases(phases: Phases, solution: Any) -> PhasesVerdict:
                 jump, v = cast(phases.between[i], torch.float64), doubled(solution.jumps[i], "jumps", member)
                 cost, violation = cost + jump.costs(end, v), torch.maximum(violation, jump.violation(end, v))
                 start = jump.after(end, v)
-        if phases.loop is not None and end is not None:
+        if phases.closing is not None and end is not None:
             violation = torch.maximum(violation, _open(phases, solution[0].X[:, 0], end))
         return _joined(phases, verdicts, cost, violation)
 
 
+def certify_phases(phases: Phases, solution: Any, asked: Tensor | None) -> Certificate:
+    """The certificate of all phases and jumps as one problem.
+
+    Raises:
+        InputError: a solution of other phases, or `asked` as of `certify`.
+    """
+    _check(phases, solution)
+    phases, found = phases.current(), solution.found.detach()
+    whole = certify(Whole(phases).problem, found.X, found.U, asked, found.multipliers.lam)
+    each = []
+    for member, part in zip(phases.members, solution.detach(), strict=True):
+        here = member._with({"x0": part.X[:, 0].to(member.x0.dtype)}, member.known)
+        each.append(certify(here, part.X, part.U, asked, part.multipliers.lam, part.times))
+    least, most = torch.fmin, torch.fmax  # NaN of phases without a position, or a field
+    return replace(
+        whole, clearance=reduce(least, (one.clearance for one in each)),
+        step_error=reduce(most, (one.step_error for one in each)),
+    )  # fmt: skip
+
+
+def _check(phases: Phases, solution: Any) -> None:
+    if not isinstance(solution, PhasesSolution) or len(solution) != len(phases):
+        raise InputError("solution", f"a PhasesSolution of {len(phases)} phases", shown(solution))
+
+
 def _open(phases: Phases, first: Tensor, last: Tensor) -> Tensor:
     """By how much a loop isn't closed from the first state (B, n) to the last (B, n'), (B,)."""
-    assert phases.loop is not None
+    assert phases.closing is not None
     n = min(first.shape[-1], last.shape[-1])
-    row = cast(phases.loop.bind(Dimensions(len(first), 1, n, 1, None, None, first)), torch.float64)
+    row = cast(phases.closing.bind(Dimensions(len(first), 1, n, 1, None, None, first)), torch.float64)
     return row.worst(torch.stack((first[:, :n].double(), last[:, :n]), dim=1), last.new_zeros(len(last), 1, 1))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any
 
@@ -68,34 +68,95 @@ class Course:
     touches: bool  # whether contact is looked for
 
 
+@dataclass(frozen=True, eq=False)
+class Leg:
+    """Trajectories of a problem: all there is, or one phase of several."""
+
+    problem: Problem
+    courses: list[Course]
+    unit: str  # of t
+
+    @classmethod
+    def of(cls, problem: Problem, solution: Solution, b: int | Sequence[int] | None) -> Leg:
+        problem = current_problem(problem)
+        courses, unit = courses_of(problem, solution, b)
+        return cls(paced(problem, solution.times), courses, unit)
+
+    def after(self, begins: np.ndarray, labels: Sequence[str]) -> Leg:
+        """The same, of problems that begin at times (B,), with other labels (B,)."""
+        moved = [replace(course, t=course.t + begins[course.b], label=labels[course.b]) for course in self.courses]
+        return replace(self, courses=moved)
+
+    @property
+    def planes(self) -> tuple[Plane, ...]:
+        position = self.problem.dynamics.position
+        return {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start, ())
+
+
 def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int] | None = None) -> Figure:
     """The figure of `torchgco.plot`; see there."""
-    problem = current_problem(problem)
-    courses, unit = courses_of(problem, solution, b)
-    problem = paced(problem, solution.times)
-    position = problem.dynamics.position
-    planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start, ())
-    shared = [courses] if is_shared(problem, courses) else [[course] for course in courses]
-    maps = [SceneMap.of(problem, group, planes) for group in shared] if planes else []
-    rows = ceil((problem.n + problem.m) / PANELS_ACROSS)
-    wide = WIDTH / len(maps) if maps else WIDTH
-    high = max((map_.height(wide) for map_ in maps), default=0.0)
+    return figure_of([Leg.of(problem, solution, b)])
+
+
+def phases_figure(
+    problems: Sequence[Problem], solutions: Sequence[Solution], begins: np.ndarray, costs: np.ndarray, b: Any
+) -> Figure:
+    """The same of phases, one after the other.
+
+    Args:
+        problems, solutions: of each phase.
+        begins: when each begins, (B, P+1), s.
+        costs: of all phases together, (B,).
+    """
+    statuses = solutions[0].statuses
+    told = enumerate(zip(statuses, costs, strict=True))
+    labels = [f"problem {i}: {status.name}, cost {cost:.6g}" for i, (status, cost) in told]
+    pairs = enumerate(zip(problems, solutions, strict=True))
+    return figure_of([Leg.of(*pair, b).after(begins[:, i], labels) for i, pair in pairs])
+
+
+def figure_of(legs: Sequence[Leg]) -> Figure:
+    """Scenes, in which all legs are drawn, and the histories of all."""
+    courses, panels = legs[0].courses, _panels(legs)
+    scenes = _scenes(legs)
+    rows = ceil(len(panels) / PANELS_ACROSS)
+    high = max((scene[0].height(WIDTH / len(scenes)) for scene in scenes), default=0.0)
     figure = NotebookFigure(figsize=(WIDTH, high + PANEL * rows), layout="constrained")
     lower: Figure | SubFigure = figure
     lines: list[Artist] = [Line2D([], [], color=course.colour, label=course.label) for course in courses]
     lines.append(Line2D([], [], color=LIMIT, linestyle="--", linewidth=0.9, label="bound, where it is near"))
-    if maps:
+    if len(legs) > 1:
+        lines.append(Line2D([], [], color=INK, linestyle=":", linewidth=0.9, label="the next phase begins"))
+    if scenes:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, PANEL * rows))[:, 0]
         drawn = set[str]()
-        for panel, map_ in zip(upper.subfigures(1, len(maps), squeeze=False)[0], maps, strict=True):
-            drawn |= map_.draw(panel)
-        lines += _handles(maps, drawn)
-    _histories(lower, problem, courses, unit)
+        for panel, scene in zip(upper.subfigures(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+            axes = scene[0].axes(panel)
+            drawn = drawn.union(*(of_leg.draw_into(axes) for of_leg in scene))
+        lines += _handles([of_leg for scene in scenes for of_leg in scene], drawn)
+    _histories(lower, panels, legs)
     across = legend_columns(lines, WIDTH)
     figure.set_figheight(high + PANEL * rows + 0.1 + 0.23 * ceil(len(lines) / across))
     look: dict[str, Any] = {"fontsize": TEXT, "frameon": False, "ncols": across}
     figure.legend(handles=lines, loc="outside upper left", **look)
     return figure
+
+
+def _scenes(legs: Sequence[Leg]) -> list[list[SceneMap]]:
+    """A scene for all courses, or one for each where their obstacles differ, with a map per leg; none where a leg has
+    no position, or one of another dimension."""
+    planes = legs[0].planes
+    if not planes or any(leg.planes != planes for leg in legs):
+        return []
+    places = range(len(legs[0].courses))
+    shared = all(is_shared(leg.problem, leg.courses) for leg in legs)
+    scenes = []
+    for group in [places] if shared else [[i] for i in places]:
+        maps = [SceneMap.of(leg.problem, [leg.courses[i] for i in group], planes) for leg in legs]
+        corners = np.stack([one.box for one in maps])
+        box = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+        scenes.append([replace(one, box=box) for one in maps])
+    return scenes
 
 
 def _places(b: Any, B: int) -> list[int]:
@@ -202,8 +263,15 @@ class SceneMap:
 
     def draw(self, figure: Figure | SubFigure) -> set[str]:
         """Draw each plane into axes of its own; returns the kinds of what is drawn, for the legend."""
+        return self.draw_into(self.axes(figure))
+
+    def axes(self, figure: Figure | SubFigure) -> Sequence[Axes]:
+        """Axes for each plane."""
         ratios = {"height_ratios": self.shares}
-        axes = figure.subplots(len(self.planes), 1, squeeze=False, gridspec_kw=ratios)[:, 0]
+        return figure.subplots(len(self.planes), 1, squeeze=False, gridspec_kw=ratios)[:, 0]  # type: ignore[no-any-return]
+
+    def draw_into(self, axes: Sequence[Axes]) -> set[str]:
+        """`draw` into axes that are there."""
         return set().union(*(self._plane(ax, plane) for ax, plane in zip(axes, self.planes, strict=True)))
 
     def _plane(self, ax: Axes, plane: Plane) -> set[str]:
@@ -276,54 +344,85 @@ def _handles(maps: Sequence[SceneMap], drawn: set[str]) -> list[Artist]:
     return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *known.values()]
 
 
-def _histories(figure: Figure | SubFigure, problem: Problem, courses: list[Course], unit: str) -> None:
+@dataclass(frozen=True, eq=False)
+class Component:
+    """A state or control of a leg."""
+
+    leg: Leg
+    state: bool
+    j: int
+
+    def series(self, course: Course) -> np.ndarray:
+        return (course.X if self.state else course.U)[:, self.j]
+
+
+def _panels(legs: Sequence[Leg]) -> dict[tuple[bool, str], list[Component]]:
+    """What each panel of the histories shows: states, then controls, of legs with the same name of it."""
+    panels: dict[tuple[bool, str], list[Component]] = {}
+    for state, named in ((True, states_of), (False, controls_of)):
+        for leg in legs:
+            for j, quantity in enumerate(named(leg.problem.dynamics)):
+                panels.setdefault((state, quantity.label), []).append(Component(leg, state, j))
+    return panels
+
+
+def _histories(
+    figure: Figure | SubFigure, panels: dict[tuple[bool, str], list[Component]], legs: Sequence[Leg]
+) -> None:
     """A panel for each state and control."""
-    count = problem.n + problem.m
+    count = len(panels)
     rows = ceil(count / PANELS_ACROSS)
     axes = list(figure.subplots(rows, min(PANELS_ACROSS, count), squeeze=False, sharex=True).flat)
-    names = [component.label for component in (*states_of(problem.dynamics), *controls_of(problem.dynamics))]
-    for i, ax in enumerate(axes[:count]):
-        state, j = i < problem.n, i if i < problem.n else i - problem.n
-        values = []
-        for course in courses:
-            series = (course.X if state else course.U)[:, j]
-            values.append(series)
-            look: dict[str, Any] = {} if state else {"drawstyle": "steps-post"}
-            t = course.t if state else course.t[:-1]
-            ax.plot(t, series, color=course.colour, linewidth=1.2, **look)
-        _limits(ax, problem, courses, values, state, j)
-        tidy(ax, names[i])
+    for i, (ax, ((state, label), components)) in enumerate(zip(axes, panels.items(), strict=False)):
+        look: dict[str, Any] = {} if state else {"drawstyle": "steps-post"}
+        for component in components:
+            for course in component.leg.courses:
+                t = course.t if state else course.t[:-1]
+                ax.plot(t, component.series(course), color=course.colour, linewidth=1.2, **look)
+        for leg in legs[1:]:
+            for course in leg.courses:
+                colour = INK if len(leg.courses) == 1 else course.colour
+                ax.axvline(course.t[0], color=colour, linestyle=":", linewidth=0.9, zorder=1)
+        _limits(ax, components)
+        tidy(ax, label)
         ax.title.set_fontsize(TEXT)
         ax.tick_params(labelsize=SMALL - 1)
         if i + PANELS_ACROSS >= count:
-            ax.set_xlabel(unit, fontsize=SMALL)
+            ax.set_xlabel(legs[0].unit, fontsize=SMALL)
             ax.tick_params(labelbottom=True)
     for ax in axes[count:]:
         ax.remove()
 
 
-def _limits(ax: Axes, problem: Problem, courses: list[Course], values: list[np.ndarray], state: bool, j: int) -> None:
+def _limits(ax: Axes, components: Sequence[Component]) -> None:
     """Dashed lines at the bounds of a component, of those that are near its values: far ones would flatten these."""
+    values = [one.series(course) for one in components for course in one.leg.courses]
     finite = np.concatenate([series[np.isfinite(series)] for series in values])
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     span = max(high - low, 1e-3 * max(abs(low), abs(high), 1e-9))
-    count = problem.N + 1 if state else problem.N
-    ends = [low, high]
+    ends, near = [low, high], (low - LIMIT_SPANS * span, high + LIMIT_SPANS * span)
+    for component in components:
+        ends += _bounds_near(ax, component, near)
+    edge = 0.06 * max(max(ends) - min(ends), span)
+    if finite.size:
+        ax.set_ylim(min(ends) - edge, max(ends) + edge)
+
+
+def _bounds_near(ax: Axes, component: Component, near: tuple[float, float]) -> list[float]:
+    """Draw the bounds of a component that are between two values; how far these reach."""
+    problem, state, j = component.leg.problem, component.state, component.j
+    count, ends = problem.N + 1 if state else problem.N, list[float]()
     for bounds in bounds_of(problem.constraints, "x" if state else "u"):
         if j >= bounds.lower.shape[-1]:
             continue
         for bound in bounds.over(count):
-            for course in courses:
+            for course in component.leg.courses:
                 row = bound[course.b if bound.shape[0] > 1 else 0, :, j].cpu().double().numpy()
                 row = np.broadcast_to(row, (count,))[: len(course.X if state else course.U)]
-                near = np.isfinite(row) & (row >= low - LIMIT_SPANS * span) & (row <= high + LIMIT_SPANS * span)
-                if near.any():
-                    t = course.t[: len(row)]
-                    mark: dict[str, Any] = {"marker": "_"} if near.sum() == 1 else {}
-                    ax.plot(
-                        t, np.where(near, row, np.nan), color=LIMIT, linestyle="--", linewidth=0.9, zorder=1, **mark
-                    )
-                    ends += [float(row[near].min()), float(row[near].max())]
-    edge = 0.06 * max(max(ends) - min(ends), span)
-    if finite.size:
-        ax.set_ylim(min(ends) - edge, max(ends) + edge)
+                shown = np.isfinite(row) & (row >= near[0]) & (row <= near[1])
+                if shown.any():
+                    mark: dict[str, Any] = {"marker": "_"} if shown.sum() == 1 else {}
+                    look: dict[str, Any] = {"color": LIMIT, "linestyle": "--", "linewidth": 0.9, "zorder": 1}
+                    ax.plot(course.t[: len(row)], np.where(shown, row, np.nan), **look, **mark)
+                    ends += [float(row[shown].min()), float(row[shown].max())]
+    return ends

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Number
 from types import FunctionType
@@ -138,20 +138,23 @@ def _facts(fields: Mapping[str, Any]) -> tuple[Hashable, ...]:
     `.data` and NumPy write unseen."""
     parts = fields["constraints"]
     facts: list[Hashable] = [_Itself(row) for row in (parts if isinstance(parts, (list, tuple)) else (parts,))]
-    facts += [_Itself(fields[name]) for name in ("dynamics", "cost")]
-    for leaf in leaves(fields):
+    return *facts, *(_Itself(fields[name]) for name in ("dynamics", "cost")), *facts_of(fields)
+
+
+def facts_of(tree: Any) -> Iterator[Hashable]:
+    """What tells whether functions and numbers in nested parts have changed."""
+    for leaf in leaves(tree):
         if isinstance(leaf, Tensor):
-            facts.append(0 if leaf.is_inference() else leaf._version)
+            yield 0 if leaf.is_inference() else leaf._version
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
-                facts.append(_sum(leaf.detach()))
+                yield _sum(leaf.detach())
         elif isinstance(leaf, (int, float, str, bytes, Number)) or leaf is None or type(leaf) in ALONE:
-            facts.append(leaf)
+            yield leaf
         elif callable(leaf):
-            facts.append(_Itself(leaf))
+            yield _Itself(leaf)
         elif isinstance(leaf, np.ndarray) or hasattr(leaf, "__array__") or isinstance(leaf, (Collection, memoryview)):
-            facts.append(_sum(leaf))
-    return tuple(facts)
+            yield _sum(leaf)
 
 
 def _sum(numbers: Any) -> int | None:

@@ -87,11 +87,10 @@ def factors_in(problem: Problem, X: Tensor) -> Tensor:
     return X[:, list(problem.time.segments), problem.n]
 
 
-def factor_controls(whole: Problem) -> slice:
-    """Which controls of a problem `in_time`, or of any other, are factors of time."""
-    model = whole.dynamics
-    chosen = isinstance(model, _Dynamics) and model.switches is not None
-    return slice(whole.m - 1, whole.m) if chosen else slice(0, 0)
+def factor_controls(whole: Problem, k: int = 0) -> slice:
+    """Which controls of stage k of a problem `in_time`, or of any other, are factors of time."""
+    model: Any = whole.dynamics
+    return model.factor_controls(k) if hasattr(model, "factor_controls") else slice(0, 0)
 
 
 def factor_state(whole: Problem) -> int:
@@ -222,6 +221,10 @@ class _Dynamics(WrappedDynamics):
     def at(self, k: int | Tensor) -> Self:
         same = self.switches is None and (self.taken is None or not self.taken.by_stage)
         return self if same else replace(self, k=k)
+
+    def factor_controls(self, k: int) -> slice:
+        """See `in_time.factor_controls`; stages where no segment ends have them, too."""
+        return slice(0, 0) if self.switches is None else slice(self.m - 1, self.m)
 
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         """The derivative by the time that runs evenly from knot to knot, dt a stage."""

@@ -15,6 +15,7 @@ class Known:
         row_shapes: knots and rows of every constraint.
         paths: whether the roadmap can seek any.
         in_c, in_pytorch: kernels; `in_c` is False where those in C can't serve.
+        code: the signature that the kernels in C were found, or are kept, by; None where it doesn't tell all.
         interior: the interior point with functions that Python computes: it knows the shapes of rows.
         expects_interior: the interior point will be asked for.
         warned: reasons for PyTorch's kernels that a warning has named.
@@ -28,6 +29,7 @@ class Known:
     paths: bool | None = None
     in_c: Any = None
     in_pytorch: Any = None
+    code: Any = None
     interior: Any = None
     expects_interior: bool = False
     warned: set[str] = field(default_factory=set)

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
@@ -30,17 +31,25 @@ EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to 
 EXACT_COSTATES = 1e-5  # share of the largest costate by which that step may change one
 
 
-def asks_for_gradients(problem: Problem) -> bool:
+def asks_for_gradients(problem: Problem, in_solve: Problem | None = None) -> bool:
     """Whether gradients are recorded, and a tensor asks for them in the problem, or one that its functions capture; or
     one of these has a tangent of forward mode.
+
+    Args:
+        in_solve: the `current` problem, which keeps what its functions capture as long as their code.
 
     Raises:
         InputError: they can't be served.
     """
     if not (torch.is_grad_enabled() or is_forward()) or torch.is_inference_mode_enabled() or problem.B == 0:
         return False
-    if not (problem.given is not None and problem.given.asks) and not _captures(problem):
-        return False
+    if not (problem.given is not None and problem.given.asks):
+        if in_solve is None or is_forward():
+            captures = _captures(problem)
+        else:
+            captures = in_solve.derive("captures", lambda: _captures(in_solve))
+        if not captures:
+            return False
     refuse_forms(problem, "tensors in it that ask for gradients (or torch.no_grad())")
     return True
 
@@ -193,7 +202,8 @@ def for_systems(problem: Problem, solution: Solution) -> tuple[Problem, Solution
         X, U = states_in_time(problem, solution.X, solution.U, factors_of(problem, solution.times))
         multipliers = lifted_multipliers(problem, whole, multipliers)
     else:
-        X, U = torch.cat((solution.X, open_loop(whole, solution.U)[..., problem.n :]), dim=-1), solution.U
+        begun = whole.guessing(pad(solution.X[:, 0], (0, whole.n - problem.n)))
+        X, U = torch.cat((solution.X, open_loop(begun, solution.U)[..., problem.n :]), dim=-1), solution.U
     return whole, replace(solution, X=X.contiguous(), U=U.contiguous(), multipliers=multipliers)
 
 

@@ -1,0 +1,134 @@
+"""One figure and one certificate of all phases."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import torchgco
+from benchmarks.families.phases import CASES
+from tests.engines import compiled
+from tests.phases.test_phases import HEAVY, NOTHING, bounces, drive
+from torchgco import (
+    Dynamics,
+    FunctionConstraint,
+    InputError,
+    Jump,
+    Link,
+    Phases,
+    PhasesSolution,
+    Problem,
+    Spheres,
+)
+
+pytestmark = compiled
+D = torch.float64
+
+
+class Steps(Dynamics):
+    n, m = 1, 1
+
+    def step(self, x: Tensor, u: Tensor) -> Tensor:
+        return x + 0.1 * u
+
+
+def driven() -> tuple[Phases, PhasesSolution]:
+    """Two drives of two problems, each past a disc of its own, the second by another model."""
+    first = drive(torch.zeros(2, 4, dtype=D), [1.0, 0.0], Spheres([[0.5, 0.15]], [0.15], 0.05), N=25)
+    second = torch.tensor([[1.0, 0.0, 0.3, 0.3], [1.0, 0.1, 0.2, 0.1]], dtype=D)
+    then = drive(second, [2.0, 1.0], Spheres([[1.5, 0.55]], [0.1], 0.05), model=HEAVY, N=25)
+    phases = Phases([first, then], [Jump(lambda x: torch.cat((x[..., :2], 0.3 * x[..., 2:]), -1))])
+    return phases, torchgco.solve(phases)
+
+
+def test_a_figure_has_the_phases_in_their_order_and_marks_the_jumps() -> None:
+    phases, solution = driven()
+    figure = torchgco.plot(phases, solution, b=1)
+    scene, *histories = figure.axes
+    assert len(histories) == 6  # the components of both models have the same names
+    position = np.concatenate([one.X[1, :, :2].numpy() for one in solution])
+    ways = [line.get_xydata() for line in scene.lines if len(line.get_xydata()) == 26]
+    np.testing.assert_allclose(np.concatenate(ways[:2]), position)
+    begins = solution.begins[1].tolist()
+    for ax in histories:
+        dotted = [line.get_xdata()[0] for line in ax.lines if line.get_linestyle() == ":"]
+        assert dotted == pytest.approx(begins[1:2])
+        assert max(line.get_xdata().max() for line in ax.lines if line.get_linestyle() == "-") <= begins[2] + 1e-9
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert f"problem 1: CONVERGED, cost {float(solution.cost[1]):.6g}" in texts and "the next phase begins" in texts
+
+
+@pytest.mark.parametrize("name", ["take-off to cruise", "bouncing ball"])
+def test_phases_of_other_sizes_and_without_a_position_are_drawn_over_time(name: str) -> None:
+    phases = CASES[name].phases(2)
+    figure = torchgco.plot(phases, torchgco.solve(phases))
+    sizes = max(one.n + one.m for one in phases.problems)
+    assert len(figure.axes) == sizes
+
+
+def test_a_model_without_a_time_step_is_drawn_by_knots() -> None:
+    row = FunctionConstraint(lambda x: x - 1.0, "equality", knots=[-1])
+    one = Problem(Steps(), NOTHING, [row], torch.zeros(1, 1, dtype=D), 4)
+    phases = Phases([one, one], [Jump(lambda x: 0.5 * x)])
+    figure = torchgco.plot(phases, torchgco.solve(phases))
+    dotted = [line.get_xdata()[0] for line in figure.axes[0].lines if line.get_linestyle() == ":"]
+    assert dotted == [4.0]
+
+
+def test_a_certificate_of_all_phases_sees_each_mistake() -> None:
+    phases, solution = driven()
+    good = torchgco.certify(phases, solution)
+    assert float(good.dynamics_residual.max()) < 1e-12 and float(good.kkt_residual.max()) < 1e-6
+    assert float(good.bound_violation.max()) == 0.0 and bool((good.clearance > -1e-2).all())
+    judged = torchgco.judge(phases, solution)
+    assert float((judged.clearance - good.clearance).max()) < 1e-2  # a bound of it
+    for knot, most in ((26, 1e-3), (40, 1e-3)):  # the first one after the jump, and one of the second phase
+        X = solution.found.X.clone()
+        X[0, knot, 2] += most
+        moved = replace(solution, found=replace(solution.found, X=X))
+        seen = torchgco.certify(phases, moved).dynamics_residual
+        assert float(seen[0]) > 0.9 * most and float(seen[1]) < 1e-12
+    lam = tuple(1.5 * z for z in solution.found.multipliers.lam)
+    pushed = replace(solution.found, multipliers=replace(solution.found.multipliers, lam=lam))
+    assert float(torchgco.certify(phases, replace(solution, found=pushed)).kkt_residual.min()) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["two impulses", pytest.param("Delta III", marks=pytest.mark.slow), "gears"])
+def test_free_times_and_impulses_are_stationary(name: str) -> None:
+    case = CASES[name]
+    phases = case.phases(2)
+    rest = None if case.push is None else [one.x0.new_tensor(case.push).expand(2, one.N, -1) for one in phases.problems]
+    certificate = torchgco.certify(phases, torchgco.solve(phases, rest))
+    assert float(certificate.kkt_residual.max()) < 1e-3 and float(certificate.dynamics_residual.max()) < 1e-12
+    assert float(certificate.step_error.max()) < 1e-3
+
+
+def test_free_starts_links_and_loops_are_stationary_and_some_are_asked_for() -> None:
+    hop = bounces(0.5, B=2)
+    asked = torch.tensor([False, True])
+    certificate = torchgco.certify(hop, torchgco.solve(hop), asked=asked)
+    assert bool(certificate.kkt_residual[0].isnan()) and float(certificate.kkt_residual[1]) < 1e-6
+    free = [True, True, False, False]
+    out = drive(torch.zeros(1, 4, dtype=D), [1.0, 0.0], free_start=free, N=8)
+    back = drive(torch.zeros(1, 4, dtype=D), [0.0, 1.0], N=8)
+    lap = Phases([out, back], [Link()], loop=Link(components=[0, 1]))
+    found = torchgco.certify(lap, torchgco.solve(lap))
+    assert float(found.kkt_residual) < 1e-6 and float(found.dynamics_residual) < 1e-12
+
+
+def test_wrong_use_gets_one_line() -> None:
+    phases, solution = driven()
+    with pytest.raises(InputError, match="solution: expected a PhasesSolution of 2 phases"):
+        torchgco.certify(phases, solution[0].X)  # type: ignore[call-overload]
+    with pytest.raises(InputError, match=r"certify\.times: expected None of phases"):
+        torchgco.certify(phases, solution, times=solution[0].X)  # type: ignore[call-overload]
+    with pytest.raises(InputError, match="solution: expected phases and their solution"):
+        torchgco.plot(phases, solution[0])
+    with pytest.raises(InputError, match="b: expected the place of a problem"):
+        torchgco.plot(phases, solution, b=2)
+    with pytest.raises(InputError, match="problem: expected a Problem"):
+        torchgco.show(phases, solution)  # type: ignore[arg-type]
