@@ -45,7 +45,8 @@ def export_c(
     and which numbers may change; `build` gives the same as a library of Arduino and PlatformIO or a module of Zephyr.
     A step does what a step of `MPC` with `solver="interior_point"` does: it continues
     from the plan before, else begins again from what that leads to now, else from rest, and where all fail it holds the
-    plan before with feedback. It doesn't search for other ways, nor for ways to come to rest.
+    plan before with feedback. It doesn't search for other ways, nor for ways to come to rest, and obstacles that move
+    are where its numbers say that they are now.
 
     Args:
         problem: one vehicle, or a compiled problem with one.

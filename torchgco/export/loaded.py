@@ -37,7 +37,8 @@ def load_c(folder: str | Path, name: str | None = None, period: float | None = N
         controller = torchgco.load_c("car_c")
         u = controller.step(x, x_ref=reference)
 
-    Its bits are those of `MPC` on this machine, as products and sums are fused alike.
+    Its bits are those of `MPC` on this machine, as products and sums are fused alike; where obstacles move, if both are
+    told in every step where they are.
 
     Args:
         name: of the controller; None: the only one in the folder.
