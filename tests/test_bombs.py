@@ -19,6 +19,7 @@ SLOW = {name for name in BOMBS if "100 MB" in name}  # some seconds
 SLOW |= {"trials.parquet, pages of 1.2 GB that name 100 bytes"}
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("name", mostly(BOMBS, *SLOW))
 def test_a_small_file_that_promises_much_is_refused(name: str, tmp_path: Path) -> None:
     told, seconds, memory, size = attempt(name, tmp_path)

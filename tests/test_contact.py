@@ -68,6 +68,7 @@ def test_no_warning_without_contact() -> None:
         torchgco.solve(row_of_discs(thin=()), solver=FAST)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("kind", ["rates", "horizons", "both"])
 def test_statuses_are_the_judges_along_the_models_own_path(kind: str) -> None:

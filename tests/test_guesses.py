@@ -122,6 +122,7 @@ def thrust(angle: bool, N: int = 30) -> Problem:
     return Problem(model, none, [part], [0, 0, 0.5, 0], N, goal=goal, time=FreeTime(0.2, 5.0, weight=1.0))
 
 
+@pytest.mark.slow
 def test_states_and_times_of_earlier_solutions_are_guesses_in_free_time() -> None:
     vector = torchgco.solve(thrust(False))
     U = torch.atan2(vector.U[..., 1], vector.U[..., 0]).unsqueeze(-1)

@@ -104,6 +104,7 @@ def solved(problem: Problem, U0: Tensor, solver: Any = LOCAL) -> tuple[Solution,
     return found, [found.X, found.U, found.K, found.d, found.cost, found.violation, found.status, found.iterations]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("kind", mostly(["map", "states"], "map"))
 def test_what_solve_checks_before_and_after_stays_on_the_device(kind: str) -> None:
@@ -122,6 +123,7 @@ OTHERS = ("spheres", "boxes", "capsules", "body", "oscillating", "function")
 SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["states", pytest.param("map", marks=pytest.mark.slow), *SLOW])
 def test_local_solves_are_judged_and_certified(kind: str) -> None:
     def work(problem: Problem, U0: Tensor) -> list[Tensor]:
@@ -141,6 +143,7 @@ def test_the_longest_step_is_found() -> None:
     on_both(work, "states")
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("kind", ["states", pytest.param("map", marks=pytest.mark.slow), *SLOW])
 def test_the_interior_point_solves(kind: str) -> None:
@@ -173,6 +176,7 @@ def test_paths_are_handed_over(kind: str) -> None:
     on_both(work, kind)
 
 
+@pytest.mark.slow
 def test_solutions_are_kept_and_shown(tmp_path: Path) -> None:
     def work(problem: Problem, U0: Tensor) -> list[Tensor]:
         found, _ = solved(problem, U0)
@@ -201,6 +205,7 @@ def test_mixed_devices_are_refused_here() -> None:
             there.numpy()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["spheres", "map", "states"])
 def test_another_default_device_changes_nothing(kind: str, tmp_path: Path) -> None:
     """Problems of the CPU are solved, judged, explained and kept there, whatever PyTorch makes elsewhere."""

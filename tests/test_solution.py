@@ -150,6 +150,7 @@ def test_torch_saves_and_loads_a_solution_without_running_code(tmp_path) -> None
     assert loaded.explain(0).splitlines()[0] == solution.explain(0).splitlines()[0]
 
 
+@pytest.mark.slow
 def test_transforms_of_pytorch_are_refused_by_name() -> None:
     problem, U0 = planar_batch(B=2, N=8)
     twice = torch.stack((U0, U0))

@@ -92,6 +92,7 @@ CASES: dict[str, list[Callable[[], object]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(13)
 @pytest.mark.parametrize("field", CASES)
 def test_a_mistake_gets_one_line_that_names_the_field(field: str) -> None:
     for i, mistake in enumerate(CASES[field]):

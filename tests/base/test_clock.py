@@ -49,6 +49,7 @@ def test_solves_and_their_limits(B: int, loads: list[float]) -> None:
     assert Status.TIME_LIMIT not in solution.statuses
 
 
+@pytest.mark.slow
 def test_a_comparison(loads: list[float]) -> None:
     problem, U0 = planar_batch(B=2, N=20, obstacles=5, seed=1)
     table = torchgco.compare(problem, ["gco", "al_ilqr", "mppi"], U0)
@@ -71,6 +72,7 @@ def test_the_rows_of_a_study(loads: list[float]) -> None:
     assert (rows["seconds"] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_missions(loads: list[float]) -> None:
     setup = compose(["experiment=mission", "study.layouts=1", "mission.duration=0.2"])
     assert setup.mission is not None

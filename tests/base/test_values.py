@@ -145,6 +145,7 @@ def test_functions_of_the_knot_are_as_precise_as_with_another_default(name: str,
         assert found.dtype is due.dtype and torch.equal(found, due)
 
 
+@pytest.mark.slow
 @compiled
 def test_new_values_need_no_new_kernel() -> None:
     first = problem()
@@ -180,6 +181,7 @@ def simple(constraint: FunctionConstraint) -> Problem:
     return Problem(model, cost, [constraint], torch.zeros(1, 4, dtype=D), N)
 
 
+@pytest.mark.slow
 def test_an_argument_k_with_a_default_is_a_constant_of_the_users() -> None:
     plain = torchgco.solve(simple(FunctionConstraint(lambda x: 2.0 * x[..., :1] - 1.0)))
     named = torchgco.solve(simple(FunctionConstraint(lambda x, k=2.0: k * x[..., :1] - 1.0)))

@@ -128,6 +128,7 @@ limited(work, 600.0)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child of a killed process ends with its time")
 @pytest.mark.parametrize(
     "number", mostly([signal.SIGINT, signal.SIGTERM, signal.SIGKILL], signal.SIGINT, signal.SIGTERM)

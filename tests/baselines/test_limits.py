@@ -35,6 +35,7 @@ class Clock:
         return counted
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.filterwarnings("ignore::torchgco.GuidanceWarning")
 @pytest.mark.parametrize(
     "name", ["al_ilqr", "ilqr", "mppi", "multistart", "gco", "gco_fast", "gco_max", "interior_point"]

@@ -69,6 +69,7 @@ def rest(problem: Problem) -> Tensor:
     return problem.x0.new_zeros(problem.B, problem.N, problem.m)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "model",
     [UNICYCLE, VELOCITY, pytest.param(FORCE, marks=pytest.mark.slow), pytest.param(STEPS, marks=pytest.mark.slow)],
@@ -95,6 +96,7 @@ def test_shapes_are_obstacles_too() -> None:
     assert bool(verdict.reached.all())
 
 
+@pytest.mark.slow
 def test_the_rest_of_the_batch_changes_nothing() -> None:
     setup = compose(["scenario=floors", "scenario.size=[9,7]", "scenario.apart=4", "scenario.stages=120", "seed=1"])
     held = setup.task(setup.layouts(3))

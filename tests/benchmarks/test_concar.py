@@ -65,6 +65,7 @@ def test_some_are_feasible_in_one_batch(model) -> None:
     torch.testing.assert_close(verdict.cost, solution.cost)
 
 
+@pytest.mark.slow
 def test_the_table_compares_with_ipopt(capsys) -> None:
     assert main(["--first", "1"]) == 0
     table = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]

@@ -52,6 +52,7 @@ def test_the_interval_holds_the_median_as_often_as_it_says(n: int) -> None:
     assert median(pd.Series([], dtype=float), ".3f") == "-"
 
 
+@pytest.mark.slow
 def test_flights_are_of_the_plans_that_the_seed_draws() -> None:
     flights = pd.DataFrame(flown_plans(61, 1, [PEER]))
     again = pd.DataFrame(flown_plans(61, 1, [PEER]))

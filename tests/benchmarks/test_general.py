@@ -16,6 +16,7 @@ from benchmarks.lib.kept import append, rows_of
 from tests.slow import mostly
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", mostly(FAMILIES, "springs30_long", *list(FAMILIES)[1::2]))
 def test_a_family_is_drawn_by_its_seed(name: str) -> None:
     family = FAMILIES[name]

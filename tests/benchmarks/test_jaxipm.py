@@ -78,6 +78,7 @@ def test_pools_follow_their_rules() -> None:
     assert spread(10, 3).tolist() == [0, 4, 9] and spread(2, 5).tolist() == [0, 1]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", mostly(NAMED, *tuple(NAMED)[1::2], "swap of 4"))
 def test_two_instances_are_solved_to_the_published_tolerance(name: str) -> None:
     scenario = NAMED[name]

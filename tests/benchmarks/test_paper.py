@@ -121,6 +121,7 @@ def _cost(draws: int) -> float:
     return float(setup.solver.solve(task.problem, task.U0, seed=0, ids=torch.tensor([draws])).cost[0])
 
 
+@pytest.mark.slow
 def test_the_samples_shown_are_those_that_the_solver_averaged() -> None:
     solve = runs.planar("gco_paper", 0, STAGES)
     call = next(step.sampling for step in solve.steps if step.sampling is not None)

@@ -36,6 +36,7 @@ def studies_here(monkeypatch) -> None:
     monkeypatch.setattr(study, "write_report", lambda *arguments: "")
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("search", oracle.SEARCH)
 def test_every_search_of_the_oracle_is_a_solver(search: str) -> None:
     compose(oracle.SEARCH[search])
@@ -53,6 +54,7 @@ def test_the_oracle_only_ever_lowers_a_cost(tmp_path: Path) -> None:
         np.testing.assert_array_equal(Layouts.load(path).best_cost, best)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("studies_here")
 def test_the_oracle_keeps_drawn_layouts_and_success_is_judged_for_them(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr("benchmarks.lib.families.DATA", tmp_path)
@@ -86,6 +88,7 @@ def test_the_quality_of_one_family(tmp_path: Path, capsys) -> None:
     assert row[0] == "| planar_trap" and row[1:4] == ["`hold`", "3", "3 [44, 100]"] and row[4] == "0 [0, 56]"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("studies_here")
 def test_success_is_judged_with_the_current_best_cost(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("benchmarks.lib.families.DATA", tmp_path)

@@ -55,6 +55,7 @@ def maze():
     return setup.solver, layouts, setup.task(layouts), 14
 
 
+@pytest.mark.slow
 def test_the_record_of_a_solve_numbers_the_paths(maze) -> None:
     solver, _, task, i = maze
     problem, U0, ids = task.problem.take(torch.tensor([i])), task.U0[i : i + 1], torch.tensor([i])
@@ -79,6 +80,7 @@ def test_candidates_are_refined_to_their_costs(maze) -> None:
         assert problem.geometric[0].clearances(X[None])[1] >= 0
 
 
+@pytest.mark.slow
 def test_a_layout_gets_a_row_and_a_picture(maze, tmp_path: Path) -> None:
     solver, layouts, task, i = maze
     row, example = study(solver, task, layouts, i, 0, 1.2 * layouts.best_cost[i], count=2)

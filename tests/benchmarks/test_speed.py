@@ -92,6 +92,7 @@ def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
         assert f"| {case} | `{solver}` |" in section_table(rows)
 
 
+@pytest.mark.slow
 def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
     bench = tiny(tmp_path)
     families.run(bench)
@@ -103,6 +104,7 @@ def test_ratios_are_those_of_their_rows(tmp_path: Path) -> None:
     assert [r["case"] for r in bench.results.rows if r["quantity"] == "not installed"] == ["forest30"]
 
 
+@pytest.mark.slow
 def test_shares_add_up(tmp_path: Path) -> None:
     """By phase, by native function, and in total. Afterwards the functions patched for the timers are restored."""
     run = native_engine.run

@@ -63,6 +63,7 @@ def test_limits_are_those_of_each_mission_by_itself() -> None:
     assert largest(steady) == (3.0, 0.0, 0.0)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", mostly(CASES, *list(CASES)[1::2]))
 def test_a_case_is_a_mission_that_can_be_composed(name: str) -> None:
     setup = compose(["experiment=mission_unknown", *CASES[name].overrides])

@@ -54,6 +54,7 @@ def test_kept_flights_are_those_of_the_layouts(name: str) -> None:
     assert len(rows) >= 96 and rows["layout_digest"].tolist() == rows["layout"].map(now).tolist()
 
 
+@pytest.mark.slow
 def test_a_stopped_run_resumes(tmp_path: Path) -> None:
     world, file = tiny(tmp_path), tmp_path / "peers.csv"
     assert fly(world, file, ["fatrop"], [0]) == [("fatrop", 0, "rest")]
@@ -71,6 +72,7 @@ def test_a_stopped_run_resumes(tmp_path: Path) -> None:
     assert bool(rows["reached"][0]) == bool(verdict.reached) and rows["status"][0] == solution.statuses[0].name
 
 
+@pytest.mark.slow
 def test_a_flight_beyond_its_limit_is_a_row(tmp_path: Path) -> None:
     world = tiny(tmp_path)
 

@@ -256,6 +256,7 @@ def test_problems_of_every_form(form: str) -> None:
     torch.testing.assert_close(mpc.solution().cost, expected.cost, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_what_a_function_captures_is_read_at_each_call() -> None:
     wind, limit = torch.tensor([0.1, 0.0], dtype=D), np.array([0.8])
     weight, gain = torch.nn.Parameter(torch.zeros(1, dtype=D)), [1.0]
@@ -322,6 +323,7 @@ def test_what_python_reads_of_captured_tensors_is_read_again_too() -> None:
         before = answer
 
 
+@pytest.mark.slow
 def test_what_python_reads_of_a_problems_own_numbers_is_no_code() -> None:
     class Cart(Dynamics):
         n, m, dt = 2, 1, DT
@@ -397,6 +399,7 @@ def test_a_mistake_changes_nothing_and_gets_one_line(numbers: Numbers, message: 
     assert all(np.array_equal(mpc.numbers[name], value) for name, value in before.items() if name != "x0")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchgco.StepWarning")  # of a car far beyond its bounds
 def test_numbers_of_one_call_are_checked_together() -> None:
     problem = driven(of_driven(2, 8))
@@ -469,6 +472,7 @@ def test_captured_numbers_that_become_or_cease_to_be_0_or_1_are_no_change_of_cod
     assert mpc.stale() is None
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["discs", "moving discs", "boxes"])
 def test_obstacles_among_a_body_have_numbers(kind: str) -> None:
     random = np.random.default_rng(0)

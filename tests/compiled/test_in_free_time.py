@@ -64,6 +64,7 @@ def drawn(seed: int, B: int = 4) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_call_gives_what_a_solve_of_the_same_numbers_gives() -> None:
     numbers = drawn(0)
     compiled = torchgco.compile(crossing(numbers), "interior_point")
@@ -106,6 +107,7 @@ def test_a_repeated_solve_traces_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not facts.hold
 
 
+@pytest.mark.slow
 def test_references_follow_the_time_as_they_are_now() -> None:
     path = lambda y: np.stack(
         (np.linspace(0, 3, N + 1), y * np.sin(np.linspace(0, 3, N + 1)), *np.zeros((2, N + 1))), -1

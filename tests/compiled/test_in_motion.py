@@ -47,6 +47,7 @@ def passing(kind: str, seed: int, t: float = 0.0) -> tuple[Any, dict[str, Any]]:
     return made[kind](), {"places": later} if kind == "moved" else {"centers": centers + t * velocities}
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("seed", "period"), [(0, 0.1), (1, 0.04), (2, 0.15)])
 def test_a_loop_that_isnt_told_is_the_one_that_is(kind: str, seed: int, period: float) -> None:

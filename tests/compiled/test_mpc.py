@@ -156,6 +156,7 @@ def test_a_reset_begins_again() -> None:
     assert torch.equal(mpc.step(START), first) and mpc.t == 0.0
 
 
+@pytest.mark.slow
 def test_a_reset_forgets_the_controls_that_rates_count_from() -> None:
     bounds, random = RateBounds(-0.1, 0.1, previous=[0.0, 0.0]), np.random.default_rng(0)
     mpc, other = MPC(driven(1, bounds)), MPC(driven(1, bounds))

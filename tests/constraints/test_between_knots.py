@@ -95,6 +95,7 @@ def test_bounds_hold_where_states_overshoot() -> None:
         assert torch.equal(one.U[0], solution.U[1])
 
 
+@pytest.mark.slow
 @compiled
 def test_c_pytorch_and_free_time() -> None:
     problem, X0 = half_a_turn(*(BetweenKnots(row) for row in RING))
@@ -186,6 +187,7 @@ def test_the_model_is_the_problems() -> None:
         replace(problem, dynamics=replace(POINT, function=lambda x, u: x, integrator="none"))
 
 
+@pytest.mark.slow
 @compiled
 def test_tightened_rows_leave_nothing_between_their_points() -> None:
     problem, X0 = half_a_turn(*(BetweenKnots(row) for row in RING))
@@ -204,6 +206,7 @@ def test_tightened_rows_leave_nothing_between_their_points() -> None:
         assert cost <= float(solution.cost) < 1.01 * cost
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.parametrize("name", ["a bound of a speed", pytest.param("a ring", marks=pytest.mark.slow),
                                   pytest.param("an oval to go around", marks=pytest.mark.slow)])  # fmt: skip
@@ -275,6 +278,7 @@ def test_what_cannot_be_tightened_is_told() -> None:
         torchgco.tightened(other, solution)
 
 
+@pytest.mark.slow
 def test_a_solution_in_free_time_is_none_of_a_fixed_problem() -> None:
     """Its states and controls lead elsewhere by steps of dt: a row was tightened by 380 times its bound."""
     problem, _ = half_a_turn(BetweenKnots(RING[0]))

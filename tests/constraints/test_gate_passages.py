@@ -192,6 +192,7 @@ def test_touching_a_plane_and_going_back_is_no_passage() -> None:
             assert found is not None and int(found.passed.sum()) == expected
 
 
+@pytest.mark.slow
 def test_a_gate_that_is_not_passed_is_named() -> None:
     """Of a point that stays at its start, and of every row."""
     for balls, told in ((False, "not crossed from behind to ahead"), (True, "from its middle, radius 0.3 m")):
@@ -211,7 +212,7 @@ def test_a_gate_that_is_not_passed_is_named() -> None:
             assert gates.told(row, knot, problem.dynamics) == f"the {what} of gate {g + 1}"
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("along", "knots"), [
     ([1.0, 1.04], [19, 21]), ([1.0, 1.04], [19, 22]), ([1.0, 1.04], [19, 23]), ([0.02, 1.98], [1, N - 1]),
 ])  # fmt: skip

@@ -102,6 +102,7 @@ def test_rows_of_squares_keep_both_knots_in_the_prism_on_their_sides(knots: list
             torch.testing.assert_close(H[b, k, :6, :6], own.mT @ (h[b, k - 1].unsqueeze(-1) * own))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     "gates", [BALLS, SQUARES, replace(BALLS, knots=[10, 30]), replace(SQUARES, knots=[[9, 28], [12, 30]])]
 )

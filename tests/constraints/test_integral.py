@@ -68,7 +68,7 @@ def made(*parts: Any, integrator: Any = "rk4", by_hand: bool = False, x0: Tensor
 BUDGET = Integral(spent, most=MOST)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4", "radau5"])
 def test_a_budget_is_that_of_a_state_written_by_hand(integrator: str) -> None:
     problem, other = made(BUDGET, integrator=integrator), made(integrator=integrator, by_hand=True)
@@ -130,6 +130,7 @@ def quadrature(b: int, X: Tensor, U: Tensor, stages: int = N) -> Tensor:
     return total
 
 
+@pytest.mark.slow
 def test_the_largest_area_beside_a_shore_is_a_segment_of_a_circle() -> None:
     """Dido's problem: y' = u, the length of the curve over 0..1 is given, the area is the largest."""
     lengths = torch.tensor([1.2, 1.4], dtype=D)
@@ -149,6 +150,7 @@ def test_the_largest_area_beside_a_shore_is_a_segment_of_a_circle() -> None:
         assert float(-solution.cost[b]) == pytest.approx(exact, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_each_problem_has_its_own_horizon() -> None:
     horizon = [15, N]
     solution = torchgco.solve(made(BUDGET, horizon=horizon))
@@ -160,7 +162,7 @@ def test_each_problem_has_its_own_horizon() -> None:
     torch.testing.assert_close(solution.U[0, :15], torchgco.solve(alone).U[0], rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("segments", [1, 2])
 def test_a_budget_in_free_time_is_that_of_a_state_written_by_hand(segments: int) -> None:
     time = FreeTime(0.3, 2.0, weight=1.0, segments=segments)
@@ -177,6 +179,7 @@ def test_a_budget_in_free_time_is_that_of_a_state_written_by_hand(segments: int)
     assert bool((hasty.violation > 0.1 * MOST).all())
 
 
+@pytest.mark.slow
 def test_it_stands_beside_rates_obstacles_and_other_integrals() -> None:
     cost = QuadraticCost(Q=[5, 5, 0, 1, 1, 0], R=[0.1, 0.1], Qf=[50, 50, 0, 1, 1, 0], x_ref=[1, 0.4, 0, 0, 0, 0])
     parts = [
@@ -207,6 +210,7 @@ def test_whole_steps_count_dt_times_the_value_at_each_knot() -> None:
     torch.testing.assert_close(total, MOST, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_functions_take_values_and_the_stage() -> None:
     weights = torch.tensor([1.0, 2.0], dtype=D)
     rate = lambda x, u, k, w: w * (1.0 + 0.1 * k) * u[..., 0].square()
@@ -225,6 +229,7 @@ def test_a_problem_has_the_same_result_alone() -> None:
         assert torch.equal(alone.X[0], whole.X[b]) and torch.equal(alone.U[0], whole.U[b])
 
 
+@pytest.mark.slow
 def test_peers_take_it_as_rows_and_fleets_of_each_vehicle() -> None:
     pytest.importorskip("casadi")
     for more in ({}, {"time": FreeTime(0.3, 2.0, weight=1.0)}):

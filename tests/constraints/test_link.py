@@ -90,7 +90,7 @@ def dense(problem: Problem, rows: Any) -> tuple[Tensor, Tensor, Tensor]:
     return v[:, :2], v[:, 2 : 2 + N], v[:, 2 + N :]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize(
     ("parts", "rows"),
     [
@@ -111,6 +111,7 @@ def test_linear_problems_have_the_solution_of_a_dense_system(parts: list[Link], 
         torch.testing.assert_close(own, lam, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_half_an_orbit_and_its_mirror_image_have_the_period_that_is_known() -> None:
     """Without a push, van der Pol's oscillator has one orbit, 6.663287 s long, and rests nowhere else."""
     model = FunctionDynamics(van_der_pol, n=2, m=1, dt=3.0 / 60, integrator="rk4")
@@ -131,6 +132,7 @@ def test_half_an_orbit_and_its_mirror_image_have_the_period_that_is_known() -> N
         assert float(exact.dynamics_residual) < 1e-12 and float(solution.violation) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_lap_of_a_race_is_as_fast_as_ipopt_drives_it() -> None:
     """States by the distance along a closed road: the end is the start of the next lap."""
     stages, length = 60, 240.0
@@ -162,6 +164,7 @@ def test_a_lap_of_a_race_is_as_fast_as_ipopt_drives_it() -> None:
     assert float((solution.X[:, 0] - solution.X[:, -1]).abs().max()) < 1e-6
 
 
+@pytest.mark.sampled(1)
 @compiled
 @pytest.mark.parametrize("free", [True, False])
 def test_links_beside_bounds_on_rates_are_as_in_ipopt(free: bool) -> None:
@@ -185,6 +188,7 @@ def test_links_beside_bounds_on_rates_are_as_in_ipopt(free: bool) -> None:
         torch.testing.assert_close(first.cost, solution.cost, rtol=2e-3, atol=0)
 
 
+@pytest.mark.slow
 @compiled
 def test_compiled_and_pytorchs_kernels_and_both_precisions_agree() -> None:
     problem = made(RISEN, MIRRORED)
@@ -219,6 +223,7 @@ def test_further_states_carry_the_earlier_knot_and_have_its_derivatives() -> Non
         torch.testing.assert_close(mine, theirs)
 
 
+@pytest.mark.slow
 def test_judge_and_certificate_read_both_knots() -> None:
     problem = made(MIRRORED, RISEN)
     solution = torchgco.solve(problem)

@@ -105,6 +105,7 @@ def in_numpy(name: str, part: Any, X: np.ndarray, U: np.ndarray) -> np.ndarray:
     return np.array(found).reshape(B, len(knots), -1)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", PARTS)
 def test_violations_are_those_of_numpy_and_rows_have_their_sign(name: str) -> None:
     problem = lander(PARTS[name])
@@ -166,6 +167,7 @@ SOLVED = (
 )
 
 
+@pytest.mark.sampled(1)
 def test_solves_natively_and_in_pytorch_as_ipopt_does(native: bool) -> None:
     problem = lander(*SOLVED, ControlBounds(-2.0, 2.0))
     solver = InteriorPoint(tolerance=1e-8, violation_tolerance=1e-7)
@@ -181,6 +183,7 @@ def test_solves_natively_and_in_pytorch_as_ipopt_does(native: bool) -> None:
         assert float(certify(problem, found.X, found.U).kkt_residual.max()) < 1e-4
 
 
+@pytest.mark.slow
 def test_the_rest_of_the_batch_changes_nothing() -> None:
     whole = torchgco.solve(lander(*SOLVED))
     for b in range(B):
@@ -190,6 +193,7 @@ def test_the_rest_of_the_batch_changes_nothing() -> None:
     assert torch.equal(torchgco.solve(loaded).U, whole.U)
 
 
+@pytest.mark.slow
 def test_a_thrust_annulus_is_left_on_the_side_that_the_cost_asks_for() -> None:
     """Less thrust than the least would be cheaper: it is the least, in norm, until the speed has to change."""
     found = torchgco.solve(lander(NormBounds("u", lower=0.6)))
@@ -213,6 +217,7 @@ def test_beside_rates_horizons_and_in_single_precision() -> None:
     torch.testing.assert_close(single.cost.double(), double.cost, rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_a_way_may_end_at_the_tip_of_its_cone() -> None:
     """A landing site is the apex of its glide slope."""
     land = torchgco.FunctionConstraint(lambda x: x[..., :6], "equality", [N])
@@ -248,6 +253,7 @@ def test_gradients_by_bounds_and_angles_are_those_of_differences() -> None:
         torch.testing.assert_close(slopes[i], (cost(*more) - cost(*less)) / 2e-5, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_explained_by_side_and_components() -> None:
     problem = lander(NormBounds(("x", [3, 4, 5]), upper=0.05), ControlBounds(-0.1, 0.1))
     found = torchgco.solve(problem)

@@ -57,6 +57,7 @@ def changes(U: Tensor, previous: Tensor | None = None) -> Tensor:
     return (U if previous is None else torch.cat((previous.unsqueeze(1), U), 1)).diff(dim=1)
 
 
+@pytest.mark.sampled(1)
 @compiled
 @pytest.mark.parametrize("previous", [None, [0.5, -0.25]])
 def test_controls_change_no_faster_natively_and_as_ipopt_finds(previous: list[float] | None) -> None:
@@ -152,6 +153,7 @@ def wide() -> dict[str, Problem]:
     }
 
 
+@pytest.mark.sampled(2)
 @compiled
 @pytest.mark.parametrize("name", ["quadratic", "diagonal", "per problem", "own expansion"])
 def test_native_iterations_are_pytorchs(name: str) -> None:

@@ -114,6 +114,7 @@ def test_solves_natively_and_in_pytorch_as_ipopt_does(native: bool) -> None:
         assert float(certify(problem, found.X, found.U).kkt_residual.max()) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", mostly(["native", "eager"], "eager"), indirect=True)
 def test_the_rest_of_the_batch_changes_nothing(native: bool) -> None:
     whole = torchgco.solve(carts(Separation(STATES, KEPT), ControlBounds(-6.0, 6.0)))
@@ -127,6 +128,7 @@ def test_the_rest_of_the_batch_changes_nothing(native: bool) -> None:
         assert torch.equal(torchgco.solve(one).U[0], whole.U[b])
 
 
+@pytest.mark.slow
 def test_beside_controls_that_change_slowly() -> None:
     solver = InteriorPoint(tolerance=1e-9, violation_tolerance=1e-8)
     problems = [carts(Separation(STATES, 0.8), RateBounds(-most, most)) for most in (1e3, 0.5)]
@@ -187,6 +189,7 @@ def test_a_touch_between_knots_is_mended_or_warned_of() -> None:
     assert mended.to_frame(problem).clearance.min() >= 0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("required", [False, True])
 def test_two_that_change_places_head_on_pass_each_other(required: bool) -> None:
     """Exactly on one line, all that stays on it jumps over the other between two knots."""

@@ -180,7 +180,7 @@ def swing_up(function, algebraic: int, integrator: str = "radau5") -> Problem:
     return Problem(model, cost, [ControlBounds(-6.0, 6.0)], torch.tensor([[0.0, -1.0, 0.0, 0.0]]), N=60)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @compiled
 @pytest.mark.parametrize(("function", "count", "drift"), [(pendulum_on_its_circle, 2, 1e-8), (pendulum, 1, 1e-5)])
 def test_algebraic_states(function, count: int, drift: float) -> None:
@@ -193,6 +193,7 @@ def test_algebraic_states(function, count: int, drift: float) -> None:
         assert float(pendulum(solution.X[:, :-1], z, solution.U)[1].abs().max()) < 1e-9
 
 
+@pytest.mark.slow
 @compiled
 def test_free_time_and_gradients() -> None:
     problem = replace(oscillator(), time=FreeTime(least=0.5, most=2.0, weight=1.0))
@@ -220,6 +221,7 @@ def test_peers_solve_the_same_collocation(peer: str) -> None:
     assert torch.allclose(torchgco.solve(problem, solver=peer, verbose=False).cost, ours.cost, rtol=1e-6)
 
 
+@pytest.mark.slow
 @compiled
 def test_a_step_without_a_root_is_not_finite() -> None:
     """x' = x^2 + 1 has, over a second, no implicit Euler step from 1."""

@@ -178,6 +178,7 @@ def test_hover_is_an_equilibrium_of_plant_and_planner() -> None:
     torch.testing.assert_close(QuadrotorPlanning().step(plan, u), plan, rtol=0, atol=1e-12)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
 def test_order_of_the_integrators(integrator: str, order: int) -> None:
     """The error of a pendulum over one second, fitted over step sizes, against a fine solution."""

@@ -85,6 +85,7 @@ def test_a_solve_is_native_and_agrees_with_the_judge_and_with_ipopt() -> None:
         torch.testing.assert_close(there.cost, solution.cost, rtol=1e-3, atol=0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", [True, False])
 def test_the_rest_of_the_batch_changes_nothing(native: bool) -> None:
     kernels.use_native(native)
@@ -162,6 +163,7 @@ def test_operations_may_differ_between_stages() -> None:
     torch.testing.assert_close(found[0].cost, found[1].cost, rtol=1e-6, atol=0.0)
 
 
+@pytest.mark.slow
 @compiled
 def test_networks_and_captured_numbers_of_some_stages() -> None:
     """Numbers that all problems share lie behind those of the forms, and may change."""

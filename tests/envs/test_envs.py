@@ -58,6 +58,7 @@ def test_gymnasium_finds_no_fault(control: Any) -> None:
     check_env(MissionEnv(problem=far(), mission=mission(duration=0.5), control=control), skip_render_check=True)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_autoreset_is_gymnasiums(mode: AutoresetMode) -> None:
     """Bit by bit as single environments in Gymnasium's own vector, with episodes that end in every way."""

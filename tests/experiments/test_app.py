@@ -19,7 +19,7 @@ from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem
 from torchgco import kernels
 from torchgco.experiments.config.build import compose, compose_config
 from torchgco.experiments.config.groups import options_of
-from torchgco.experiments.flying import progress, study
+from torchgco.experiments.flying import progress, together
 from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive, digest
 from torchgco.scenarios import Layouts
@@ -71,7 +71,7 @@ def test_a_study_writes_all_its_files(run, tmp_path) -> None:
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("without_report")
 def test_the_bar_counts_the_solved_problems(workers: int, run, monkeypatch) -> None:
-    monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr(together, "tqdm", partial(tqdm, mininterval=0))
     monkeypatch.setattr(progress, "watched", lambda: True)
     words = ["solver=al_ilqr", "study.baselines=[]", *TINY[:4], f"study.workers={workers}", "hydra.run.dir=out"]
     code, _, err = run(*words)
@@ -111,6 +111,7 @@ def test_the_order_of_a_table_is_part_of_a_study() -> None:
     assert codes[0] != codes[1] and codes[0] == codes[2]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
     """test_resume.py tests the same for the number of processes."""
@@ -123,6 +124,7 @@ def test_results_do_not_depend_on_the_batch_size(run, tmp_path) -> None:
     assert one.success.isna().all()  # no best cost: one solver, and none in a file
 
 
+@pytest.mark.slow
 def test_out_of_memory_halves_the_batch(run, tmp_path, monkeypatch) -> None:
     def begin(self, rows, real=OuterLoop.begin):
         if rows.numel() > 1:
@@ -135,6 +137,7 @@ def test_out_of_memory_halves_the_batch(run, tmp_path, monkeypatch) -> None:
     assert (pd.read_parquet(tmp_path / "out" / "trials.parquet").batch_size == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_sweep_writes_separate_results(run, tmp_path) -> None:
     sweep = ["-m", "solver=hold,ilqr", "scenario.num_obstacles=2,3"]
@@ -145,6 +148,7 @@ def test_a_sweep_writes_separate_results(run, tmp_path) -> None:
     assert sorted(t.solver[0] for t in tables) == ["hold", "hold", "ilqr", "ilqr"]
 
 
+@pytest.mark.slow
 def test_start_inside_an_obstacle_is_a_status(run, tmp_path) -> None:
     centers = np.array([[[0.0, 0.5]], [[-1.0, 0.0]]])
     np.savez(tmp_path / "two.npz", centers=centers, radii=np.full((2, 1), 0.1))
@@ -182,6 +186,7 @@ BAD = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("case", BAD)
 def test_mistakes_get_one_clear_line(case: str, run) -> None:
     words, message = BAD[case]

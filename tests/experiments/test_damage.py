@@ -67,7 +67,7 @@ def same(one: tuple[pd.DataFrame, bytes], other: tuple[pd.DataFrame, bytes]) -> 
     assert one[1] == other[1]
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("damage", mostly(DAMAGE, "empty", "text", "cut"))
 @pytest.mark.parametrize("name", FINISHED)
@@ -81,7 +81,7 @@ def test_a_damaged_file_of_a_finished_study_is_named_and_repaired(name: str, dam
     same(results(out), before)
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("damage", mostly(DAMAGE, "empty", "text"))
 def test_a_damaged_shard_is_named_and_repaired(damage: str, run, run_until, tmp_path, out) -> None:
@@ -101,6 +101,7 @@ def test_a_damaged_shard_is_named_and_repaired(damage: str, run, run_until, tmp_
     same(results(out), before)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_damaged_mark_of_a_finished_study_is_named_and_repaired(run, out) -> None:
     before = results(out)
@@ -130,7 +131,7 @@ FOREIGN = {
 }
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize("case", mostly(FOREIGN, "scene", "layouts"))
 def test_a_shard_of_something_else_is_refused(case: str, run, run_until, tmp_path, out) -> None:
@@ -159,7 +160,7 @@ def test_repair_does_not_overwrite_another_study(run, out) -> None:
 STEPS = ["study.json", "config.yaml", "hold-000002-000003.npz", "trials.parquet", "layouts.npz", "summary.csv"]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", mostly([*STEPS, "rates.png", "done"], *STEPS[1:4], "rates.png"))
 def test_a_full_disk_gets_one_line_and_leaves_no_parts(name: str, run, tmp_path, monkeypatch, request) -> None:
     if name not in ("summary.csv", "rates.png"):

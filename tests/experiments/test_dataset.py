@@ -53,6 +53,7 @@ def test_arrays_of_different_shapes_stand_in_one_column() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(back, whole, strict=True) if b.size)
 
 
+@pytest.mark.slow
 def test_rows_are_what_the_solver_returned_however_they_were_cut(tmp_path: Path) -> None:
     assert run(tmp_path / "a", *SOLVED, "study.layouts=5", "study.shard_size=2", ALONE) == 0
     assert run(tmp_path / "b", *SOLVED, "study.layouts=3", "study.batch_size=1", ALONE) == 0
@@ -74,6 +75,7 @@ def test_rows_are_what_the_solver_returned_however_they_were_cut(tmp_path: Path)
         np.testing.assert_allclose(rows["cost"], verdict.cost.numpy(), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_stopped_one_goes_on_and_another_configuration_is_refused(tmp_path: Path, monkeypatch, capsys) -> None:
     words, kept, folder = [*HOLD, "study.layouts=6", "study.shard_size=2"], [], tmp_path / "data"
 
@@ -100,6 +102,7 @@ def test_a_stopped_one_goes_on_and_another_configuration_is_refused(tmp_path: Pa
     assert record[1]["ended"] == "finished" and record[1]["command"].startswith("torchgco-dataset ")
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_named_and_redone_on_request(tmp_path: Path, capsys) -> None:
     words = [tmp_path, *HOLD, "study.layouts=4", "study.shard_size=2"]
     assert run(*words) == 0
@@ -117,6 +120,7 @@ def test_a_damaged_file_is_named_and_redone_on_request(tmp_path: Path, capsys) -
     assert run(*words) == 2 and "dataset.json, which is missing" in problem_line(capsys.readouterr().err)
 
 
+@pytest.mark.slow
 def test_shares_make_one_data_set_and_a_second_start_is_refused_in_a_line(tmp_path: Path, monkeypatch, capsys) -> None:
     words = [tmp_path, *HOLD, "study.layouts=5", "study.shard_size=2"]
     for job in (1, 0):
@@ -146,6 +150,7 @@ def test_the_card_names_every_column_the_counts_and_the_license(tmp_path: Path) 
     assert "| X | double | (6, 6) |" in text and "heading [rad]" in text
 
 
+@pytest.mark.slow
 def test_layouts_of_different_lengths_and_maps_of_their_own(tmp_path: Path) -> None:
     assert run(tmp_path, "scenario=floors", "solver=hold", "study.layouts=3", ALONE) == 0
     rows, layouts = torchgco.read_dataset(tmp_path), torchgco.compose(["scenario=floors", "study.layouts=3"]).layouts()
@@ -167,6 +172,7 @@ def test_a_map_of_all_layouts_is_kept_once(tmp_path: Path) -> None:
     assert "All layouts share map.npz" in (tmp_path / "data" / "README.md").read_text()
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("words, line", [
     (["experiment=mission"], "mission: expected null"),
     (["scenario=fleet_door"], "single vehicles"),

@@ -10,6 +10,7 @@ from tests.experiments.commands import HOLD, TINY, problem_line
 from torchgco.experiments.reports import explained
 
 
+@pytest.mark.slow
 def test_failed_layouts_are_explained_also_of_a_finished_study(run, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(explained, "EXPLAINED", 3)
     words = [*HOLD, "study.figures=false", "hydra.run.dir=out"]
@@ -27,6 +28,7 @@ def test_failed_layouts_are_explained_also_of_a_finished_study(run, tmp_path, mo
     assert "Layout 3, solved" not in out and out.count("goal not reached") == 3
 
 
+@pytest.mark.slow
 def test_a_search_is_told_and_has_the_results_of_the_study(run, tmp_path) -> None:
     code, out, err = run(*TINY, "study.baselines=[]", "study.figures=false", "study.explain=true", "hydra.run.dir=out")
     assert code == 0, err

@@ -34,6 +34,7 @@ def test_single_trajectories(run, tmp_path, capsys) -> None:
     np.testing.assert_allclose(fine["t [s]"].iloc[-1], table["t [s]"].iloc[-1], atol=0.02)
 
 
+@pytest.mark.slow
 def test_missions_as_they_were_flown(run, tmp_path) -> None:
     code, _, err = run(*MISSION)
     assert code == 0, err
@@ -56,6 +57,7 @@ def test_missions_as_they_were_flown(run, tmp_path) -> None:
     np.testing.assert_allclose((q**2).sum(1), 1.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_bags_of_missions(run, tmp_path) -> None:
     """Read back: the path and the trajectory are the columns of the CSV, in ROS's order and axes."""
     store = pytest.importorskip("rosbags.typesys").get_typestore(import_module("rosbags.typesys").Stores.ROS2_HUMBLE)

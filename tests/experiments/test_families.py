@@ -153,6 +153,7 @@ def test_what_cannot_be_compared_is_refused_in_a_line(change, measure: str, word
     assert words in str(raised.value) and "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
 def test_the_report_writes_table_and_figure(tmp_path: Path, capsys) -> None:
     (tmp_path / "run").mkdir()
     drawn(8, 3, (6, 5)).to_parquet(tmp_path / "run" / "trials.parquet", index=False)

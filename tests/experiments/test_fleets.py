@@ -88,6 +88,7 @@ def test_a_file_of_fleets(run, tmp_path) -> None:
     assert code == 0 and "1/1 100 %" in out, err
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("words", "line"),
     [
@@ -106,6 +107,7 @@ def test_what_a_study_of_fleets_refuses(run, tmp_path, words, line) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_pages_of_fleets_have_no_search(run, tmp_path) -> None:
     assert run(*WORDS[:2], "study.layouts=1", "study.figures=false", "study.workers=1", "hydra.run.dir=out")[0] == 0
     assert view([str(tmp_path / "out"), "--search", "0"]) == 2

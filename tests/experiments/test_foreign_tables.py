@@ -58,6 +58,7 @@ def sealed(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES)
 def test_a_table_that_is_no_study_s_is_one_line(case: str, flown: Path, tmp_path: Path, capsys) -> None:
     folder = copied(flown, tmp_path / "run")

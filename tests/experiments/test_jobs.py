@@ -61,6 +61,7 @@ def test_missions_are_cut_over_jobs(run, tmp_path) -> None:
     same(tmp_path / "outputs", tmp_path / "whole")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_job_flies_its_share_whatever_the_others_do(run, tmp_path) -> None:
     words = [*HOLD[:2], "study.layouts=6", *HOLD[3:], "study.jobs=3"]
@@ -76,6 +77,7 @@ def test_a_job_flies_its_share_whatever_the_others_do(run, tmp_path) -> None:
     assert code == 0 and "already done" in out
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_study_with_a_missing_share_gets_one_line_and_keeps_its_shards(run, tmp_path) -> None:
     code, _, err = run("-m", "study.jobs=2", "study.job=1", *HOLD)
@@ -84,6 +86,7 @@ def test_a_study_with_a_missing_share_gets_one_line_and_keeps_its_shards(run, tm
     assert run("-m", "study.jobs=2", "study.job=range(0,2)", *HOLD)[0] == 0
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("words", "got"),
     [
@@ -112,6 +115,7 @@ def test_every_layout_belongs_to_one_share(jobs: int) -> None:
     assert replace(plan, job=0, jobs=jobs).share([0, 10], 11) == [number for number in (0, 10) if number in shares[0]]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_failing_job_gets_one_line_and_the_others_are_kept(run, tmp_path) -> None:
     code, out, err = run("-m", *HOLD, "seed=-1,0", "scenario.num_obstacles=2,3")
@@ -201,6 +205,7 @@ def test_a_write_survives_the_end_of_the_study_in_another_process(name: str, tmp
     assert (tmp_path / name).read_bytes() == b"new" and len(written) == 2
 
 
+@pytest.mark.slow
 def test_a_record_of_every_start(run, run_until, tmp_path, without_report) -> None:
     words = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"]
     run_until(1, *words)

@@ -123,6 +123,7 @@ def test_a_killed_holder_is_none(number: int | None, tmp_path, monkeypatch) -> N
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient", "without_report")
 def test_a_study_is_held_until_its_command_ends(run, tmp_path) -> None:
     words = [*HOLD, "hydra.run.dir=out"]

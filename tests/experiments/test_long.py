@@ -99,6 +99,7 @@ def test_jobs_that_share_studies_of_a_sweep_give_them_its_columns(run, tmp_path:
     assert [list(table.columns[-2:]) for table in tables(tmp_path / "outputs")] == [[NUMBER, LIMIT]] * 4
 
 
+@pytest.mark.slow
 def test_the_long_table_as_a_file_and_on_the_terminal(swept: Path, tmp_path: Path, capsys) -> None:
     capsys.readouterr()
     output = tmp_path / "a folder"
@@ -128,6 +129,7 @@ def test_formulas_in_names_are_inert_in_the_long_table(tmp_path: Path) -> None:
     assert pd.read_csv(tmp_path / "out" / "trials.csv")["solver"].tolist() == ["'=1+1", "<b>"]
 
 
+@pytest.mark.slow
 def test_reading_loads_neither_hydra_nor_matplotlib() -> None:
     code = "import sys, torchgco; torchgco.read; print([m for m in ('hydra', 'matplotlib') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)

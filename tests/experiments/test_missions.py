@@ -17,7 +17,7 @@ from tqdm import tqdm
 from tests.experiments.commands import problem_line
 from tests.trials import missions
 from tests.trials import trials as hand_made
-from torchgco.experiments.flying import progress, study
+from torchgco.experiments.flying import progress, together
 from torchgco.experiments.reports import mission_report, report
 from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.statistics.missions import mission_lines
@@ -37,7 +37,7 @@ def trials(folder: Path) -> pd.DataFrame:
 
 
 def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(study, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr(together, "tqdm", partial(tqdm, mininterval=0))
     monkeypatch.setattr(progress, "watched", lambda: True)
     code, out, err = run("experiment=mission", *SHORT)
     assert code == 0 and "forest 0, gco: TIMEOUT after 0.20 s" in out
@@ -81,6 +81,7 @@ def test_a_mission_with_a_footprint_is_drawn_and_verified_with_it(run, tmp_path)
     assert not verified.differs
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_figures")
 def test_the_figures_show_all_commands(run, tmp_path, monkeypatch) -> None:
     seen = {}
@@ -110,6 +111,7 @@ def test_missions_fly_without_figures_which_are_drawn_when_asked_for(run, tmp_pa
     assert code == 2 and "study.figures: expected true or false, got 'some'" in problem_line(err)
 
 
+@pytest.mark.slow
 def test_times_of_a_batch_are_not_printed_as_latencies(run) -> None:
     code, out, _ = run("experiment=mission", *SHORT, "study.layouts=2", "study.figures=false")
     lines = out.splitlines()[:2]
@@ -155,7 +157,7 @@ def test_a_start_in_contact_is_a_collision_and_the_others_fly(run, tmp_path) -> 
     assert trials(tmp_path)["outcome"].tolist()[:2] == ["COLLISION", "TIMEOUT"]
 
 
-@pytest.mark.sampled(5)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("words", "field"),
     [
@@ -212,6 +214,7 @@ class OfFile(RotorPlant):
         return RotorPlant(self.airframe, self.dt, float(Path(self.model).read_text())).advance(x, u, force)
 
 
+@pytest.mark.slow
 def test_what_a_plants_file_says_belongs_to_the_study(run, tmp_path) -> None:
     (tmp_path / "plant").mkdir()
     (tmp_path / "plant" / "mine.yaml").write_text(f"_target_: {__name__}.OfFile\nmodel: mass.txt\n")

@@ -44,6 +44,7 @@ def test_every_name_is_a_column_of_the_summary() -> None:
     assert objective_of(table, "reached_rate", "gco") == 0.75 and objective_of(table, "reached_rate", "hold") == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_sweeper_gets_a_number_for_each_job(returned: list[Any], run, tmp_path: Path) -> None:
     code, out, err = run("-m", *WORDS, "scenario.num_obstacles=2,3", "study.objective=violation_median")
@@ -57,7 +58,7 @@ def test_a_sweeper_gets_a_number_for_each_job(returned: list[Any], run, tmp_path
     assert code == 0 and all(isinstance(report, Report) for report in returned[2:]), "without an objective as before"
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize(
     ("words", "told"),
@@ -90,6 +91,7 @@ def by_hand(n: int, first: float, second: float) -> float:
     return total
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("n", [1, 5, 6, 13, 30])
 @pytest.mark.parametrize(("first", "second"), [(0.4, 0.1), (0.2, 0.0), (0.7, 0.3), (0.05, 0.05)])
 def test_power_is_that_of_the_test_in_reports(n: int, first: float, second: float) -> None:

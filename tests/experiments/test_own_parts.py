@@ -117,6 +117,7 @@ def flown(stages: int = 20) -> np.ndarray:
     return np.array(states)
 
 
+@pytest.mark.slow
 def test_constraint_parts_and_metrics_are_those_of_plain_maths(run, words: list[str], tmp_path: Path, capsys) -> None:
     assert run("--config-dir", "mine", *words, "hydra.run.dir=out")[0] == 0
     table, X = pd.read_parquet(tmp_path / "out" / "trials.parquet"), flown()
@@ -141,6 +142,7 @@ def test_constraint_parts_and_metrics_are_those_of_plain_maths(run, words: list[
     assert "fold, way" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_metrics_belong_to_a_study_and_reports_join_studies_with_and_without(run, words, tmp_path: Path) -> None:
     mine = ["--config-dir", "mine", *words]
     assert run(*mine, "hydra.run.dir=a")[0] == 0
@@ -152,6 +154,7 @@ def test_metrics_belong_to_a_study_and_reports_join_studies_with_and_without(run
         assert len(table) == 2 and table["way"].notna().all()
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("word, line", [
     ("+study.metrics.cost=own_parts.way", "study.metrics.cost: expected a name of its own"),
     ("+study.metrics.gates_passed=own_parts.way", "study.metrics.gates_passed: expected a name of its own"),

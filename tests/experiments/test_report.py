@@ -82,6 +82,7 @@ def flown(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_trajectories_are_made_from_the_controls_and_drawn(flown: Path) -> None:
     seen = {}
 
@@ -158,6 +159,7 @@ def test_a_broken_file_is_named(tmp_path: Path) -> None:
         merge([tmp_path])
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_writes_the_merged_report(tmp_path: Path, capsys) -> None:
     study(tmp_path / "a", *flights("gco", HITS))
     study(tmp_path / "b", *flights("gco", HITS, seed=1))
@@ -238,6 +240,7 @@ def test_missions_are_in_every_format(form: str) -> None:
     assert "COLLISION" in text if form in ("markdown", "latex") else "collision_rate" in text
 
 
+@pytest.mark.slow
 def test_missions_keep_their_columns_next_to_a_study(tmp_path: Path, capsys) -> None:
     """Without keys of missions in the other study, rows were named by their folders."""
     base = {"scenario": {"name": "forest", "num_obstacles": 10}, "model": {"vehicle": {"name": "quadrotor"}}}

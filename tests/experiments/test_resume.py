@@ -53,6 +53,7 @@ def test_the_settings_of_a_baseline_are_part_of_the_default_folder(run, tmp_path
     assert sorted(map(max, outer)) == [1, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_stopped_study_is_not_finished_with_other_settings(run, run_until, tmp_path) -> None:
     run_until(3, *mine(tmp_path, 1), "study.shard_size=2", "hydra.run.dir=out")
@@ -60,7 +61,7 @@ def test_a_stopped_study_is_not_finished_with_other_settings(run, run_until, tmp
     assert code == 2 and "max_outer_iterations" in problem_line(err)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.usefixtures("without_report")
 @pytest.mark.parametrize(
     "words", [["seed=1"], ["study.batch_size=0"], ["scenario.num_obstacles=4"], ["study.baselines=[mppi]"]]
@@ -102,6 +103,7 @@ def test_the_default_folder_does_not_depend_on_the_pieces(run, tmp_path) -> None
     assert len(list((tmp_path / "outputs").iterdir())) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_batch_size_is_how_many_ran_together(run, tmp_path) -> None:
     words = ["solver=al_ilqr", "study.layouts=5", TINY[1], "study.batch_size=4", "study.workers=1"]
@@ -188,6 +190,7 @@ def test_success_follows_the_best_costs_of_the_file(run, filed, tmp_path) -> Non
     assert code == 0 and "computed again" not in text and contents(out)["trials.parquet"] == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report")
 def test_a_stop_while_success_is_computed_again_damages_nothing(run, filed, tmp_path, monkeypatch) -> None:
     words, save = filed

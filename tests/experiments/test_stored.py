@@ -60,6 +60,7 @@ def test_the_parts_of_a_study_are_made_as_they_were() -> None:
     assert mission.planner.solver == ILQR() and type(mission.plant).__name__ == "RotorPlant"
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("case", FOREIGN)
 def test_all_else_is_one_line_and_runs_nothing(case: str, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -94,6 +95,7 @@ def test_options_of_other_libraries_are_refused() -> None:
         solver_from({**solver, "options": {"output_file": "written"}})  # IPOPT would write that file
 
 
+@pytest.mark.slow
 def test_the_commands_refuse_a_crafted_run_and_make_own_classes_when_told(run, tmp_path, capsys) -> None:
     words = ["scenario=yard", *HOLD, "study.figures=false", "hydra.run.dir=flown"]
     assert run(*words)[0] == 0
@@ -116,6 +118,7 @@ def test_the_commands_refuse_a_crafted_run_and_make_own_classes_when_told(run, t
     assert RAN == [0.3, 0.3]
 
 
+@pytest.mark.slow
 def test_a_study_writes_the_page_of_its_own_classes(run, tmp_path) -> None:
     held = f"{{_target_: {__name__}.own, value: 0.3}}"
     code, _, err = run("scenario=yard", *HOLD, "study.figures=false", "study.view=true", f"model.vehicle.radius={held}")

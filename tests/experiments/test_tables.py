@@ -118,6 +118,7 @@ def test_latex_escapes_names() -> None:
     assert r"al\_ilqr [a\_b=50\%]" in format_report(parts_of(table), "latex")
 
 
+@pytest.mark.slow
 def test_the_command_writes_both_tables_and_a_figure_per_swept_variable(sweep: Path, capsys) -> None:
     assert main([str(sweep)]) == 0
     out = sweep / "report"
@@ -157,6 +158,7 @@ def test_paired_costs_are_compared_where_both_arrived() -> None:
     assert np.isnan(compare(trials(*rows[:3], *rows[10:13])).iloc[0].cost_low), "too few for an interval"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report", "without_figures")
 def test_a_study_that_still_runs_is_reported_with_a_note(run, run_until, tmp_path: Path, capsys) -> None:
     words = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"]
@@ -174,6 +176,7 @@ def test_a_study_that_still_runs_is_reported_with_a_note(run, run_until, tmp_pat
     assert whole.attrs["unfinished"] == [] and len(whole) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_report", "without_figures")
 def test_a_study_without_trials_or_with_a_missing_table_is_named(run, run_until, tmp_path: Path, capsys) -> None:
     words = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"]

@@ -56,6 +56,7 @@ def change(folder: Path, column: str, row: int, value: object = None) -> None:
     table.to_parquet(folder / "trials.parquet", index=False)
 
 
+@pytest.mark.slow
 def test_an_unchanged_study_is_confirmed(out, capsys) -> None:
     assert main(["--verify", str(out)]) == 0
     text = capsys.readouterr().out
@@ -67,6 +68,7 @@ def test_an_unchanged_study_is_confirmed(out, capsys) -> None:
 TABLES = {"summary.csv": ("reached_count", "hold"), "paired.csv": ("only_a", "al_ilqr hold reached")}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_that_count_the_rows_are_counted_again(name: str, out, capsys) -> None:
     column, key = TABLES[name]
@@ -89,6 +91,7 @@ def test_tables_that_count_the_rows_are_counted_again(name: str, out, capsys) ->
     assert f"not confirmed: {path}, which is missing" in text and f"rows of {name}" not in text
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("form", mostly(["csv", "json", "markdown", "latex"], "markdown", "latex"))
 def test_the_formats_give_what_was_confirmed_and_what_was_not(form: str, out, flown, capsys) -> None:
     assert main(["--verify", str(out), str(flown), "--format", form]) == 0
@@ -121,7 +124,7 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("column", COLUMNS)
 def test_a_changed_value_is_found(column: str, out, capsys) -> None:
     change(out, column, 4)
@@ -200,6 +203,7 @@ def test_a_study_that_still_runs_is_left_out(run_until, tmp_path, capsys, withou
     assert "finished study" in problem_line(capsys.readouterr().err)
 
 
+@pytest.mark.slow
 def test_missions_are_confirmed_as_far_as_their_log_goes(flown, capsys) -> None:
     assert main(["--verify", str(flown)]) == 0
     text = capsys.readouterr().out

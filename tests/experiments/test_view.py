@@ -21,6 +21,7 @@ MISSION = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_study_writes_its_page_and_the_command_writes_it_again(run, tmp_path, capsys) -> None:
     code, out, err = run("scenario=yard", *WORDS, "hydra.run.dir=study")
     page = tmp_path / "study" / "view.html"

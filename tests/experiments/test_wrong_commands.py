@@ -106,7 +106,7 @@ def test_a_layout_file_and_a_map_are_found_at_home(tmp_path, monkeypatch) -> Non
     assert read("~/m.npy", resolution=1.0).occupied.shape == (5, 5)
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_words_get_one_line_and_write_nothing(case: str, run, tmp_path) -> None:
     words, line = WRONG[case]
@@ -171,6 +171,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("key", SETTINGS)
 def test_wrong_settings_are_refused_by_name(key: str, composed) -> None:
     values, line = SETTINGS[key]

@@ -121,6 +121,7 @@ def test_the_widest_way_is_that_of_a_plain_search(shape: tuple[int, ...]) -> Non
     assert len(set(found)) > 1
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_place_off_a_map_that_is_occupied_all_around_is_named(seed: int) -> None:
     """On any side, of the start or the goal; not where the outside is free, nor a place on the map."""
@@ -142,6 +143,7 @@ def test_a_place_off_a_map_that_is_occupied_all_around_is_named(seed: int) -> No
         assert "outside" not in told(problem(cells, 0.3, goal))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", mostly([0.5, 1.0, 3.0], 0.5, 3.0))
 def test_a_longer_horizon_is_advised_only_where_the_way_asks_for_it(speed: float) -> None:
     """A vehicle that stays where it is, square to a way around a wall: about 8 m, where 6 are straight."""

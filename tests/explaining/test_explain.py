@@ -51,6 +51,7 @@ def block(text: str, title: str) -> list[str]:
     return lines
 
 
+@pytest.mark.slow
 def test_it_tells_each_pass_that_worked_and_what_it_gave(recorded: Solution) -> None:
     search = recorded.search
     assert search is not None
@@ -134,6 +135,7 @@ def test_the_worst_row_the_goal_and_the_status_are_told(recorded: Solution) -> N
     assert told in line and f"by {worst.violation:.4g} m" in line
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", ["gco_fast", "gco_paper", "al_ilqr", "ilqr", "mppi", "interior_point", "hold"])
 def test_every_solver_is_explained_with_and_without_a_record(name: str) -> None:
     problem, U0 = planar_batch(B=2, N=20, obstacles=3)
@@ -231,6 +233,7 @@ def test_knots_are_told_in_runs() -> None:
     assert knots_told([0, 2, 4, 6, 8], None).endswith("0, 2, 4, 6 and 1 more")
 
 
+@pytest.mark.slow
 def test_a_row_that_the_start_breaks_is_named_as_the_starts() -> None:
     """And only such a row: one that the controls could have kept isn't."""
     cart = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0]), dim=-1), 2, 1, 0.1)
@@ -244,6 +247,7 @@ def test_a_row_that_the_start_breaks_is_named_as_the_starts() -> None:
     assert "No control moves" not in told and "Another guess" in told
 
 
+@pytest.mark.slow
 def test_a_row_without_a_slope_ends_infeasible_and_is_named() -> None:
     """It isn't a number that isn't finite; and a row that only may be flat elsewhere isn't named so."""
     cart = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0]), dim=-1), 2, 1, 0.1, "rk4")

@@ -59,6 +59,7 @@ def test_goals_behind_a_wall_that_was_not_known_are_reached(flown: tuple[Problem
         assert end.outcome is Outcome.REACHED and end.clearance > 0.02
 
 
+@pytest.mark.slow
 def test_every_period_holds_a_safe_plan(flown: tuple[Problem, MissionLog]) -> None:
     problem, log = flown
     safe = safe_arrays(log, problem)["safe"]
@@ -97,6 +98,7 @@ def test_plans_keep_the_speed_and_end_at_rest(flown: tuple[Problem, MissionLog])
         assert float(ends.norm(dim=-1).max()) <= 0.1 * log.period
 
 
+@pytest.mark.slow
 def test_a_mission_is_the_same_alone(flown: tuple[Problem, MissionLog]) -> None:
     problem, log = flown
     second = torch.tensor([1])
@@ -181,6 +183,7 @@ def test_known_moving_bodies_are_made_way_for() -> None:
     assert end.outcome is not Outcome.COLLISION and end.clearance > 0.1 and end.goal_distance < 2.0
 
 
+@pytest.mark.slow
 def test_plans_in_unknown_space_weigh_what_the_vehicle_weighs() -> None:
     """On the moon, too: it neither falls nor rises in the first half second."""
     moon = Airframe(gravity=1.62)

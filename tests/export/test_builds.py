@@ -86,12 +86,13 @@ def test_a_sketch_steps_once_a_period(folders: dict[str, Path], tmp_path: Path) 
     assert len(lines) == 20 and all(re.fullmatch(r"status 1( -?\d\.\d{6}){2}", line) for line in lines)
 
 
+@pytest.mark.slow
 @needs("gcc", "g++")
 def test_a_sketch_finds_the_bits_of_python(folders: dict[str, Path], tmp_path: Path) -> None:
     assert ran(folders["arduino"], "car_test", 1, tmp_path).splitlines() == [SAME, "the same bits"]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @needs("cmake", "gcc")
 @pytest.mark.parametrize("program", ["main", "test"])
 def test_a_sample_of_zephyr_runs(folders: dict[str, Path], program: str, tmp_path: Path) -> None:

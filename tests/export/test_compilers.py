@@ -80,6 +80,7 @@ def test_sanitizers_find_nothing(folder: Path, tmp_path: Path) -> None:
     assert said(tmp_path / "run", folder=folder).startswith(SAME)
 
 
+@pytest.mark.slow
 @needs("gcc", "nm")
 def test_no_heap_no_state_and_four_names(folder: Path, tmp_path: Path) -> None:
     said("gcc", *STRICT, "-O2", NATIVE, "-c", "car.c", "-o", tmp_path / "car.o", folder=folder)
@@ -123,6 +124,7 @@ def test_its_folder_builds_by_cmake(folder: Path, tmp_path: Path) -> None:
     assert "100% tests passed" in said("ctest", "--test-dir", tmp_path / "build", folder=folder)
 
 
+@pytest.mark.slow
 @needs("aarch64-linux-gnu-gcc", "qemu-aarch64")
 def test_a_64_bit_arm(folder: Path, tmp_path: Path) -> None:
     words = *STRICT, "-O2", "-static", "car.c", "car_test.c", "-lm", "-o", tmp_path / "run"

@@ -44,7 +44,7 @@ def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHGCO_CFLAGS", "-O1")
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning", "ignore::torchgco.HorizonWarning")
 @pytest.mark.parametrize("kind", mostly(KINDS, *(set(KINDS) - set(QUICK))))
 def test_steps_have_the_bits_of_python(kind: str, tmp_path: Path) -> None:
@@ -68,6 +68,7 @@ def member(numbers: dict[str, np.ndarray], name: str) -> str:
     )
 
 
+@pytest.mark.slow
 def test_only_chosen_numbers_change(tmp_path: Path) -> None:
     folder = exported(
         car(Spheres([[2.5, 0.6]], [0.3], 0.2)), tmp_path, "x_ref", "constraints[0].upper", "vehicle_radius"
@@ -119,6 +120,7 @@ def test_functions_that_only_python_computes_are_refused(tmp_path: Path) -> None
     assert not (tmp_path / "folder").exists()
 
 
+@pytest.mark.slow
 def test_a_compiled_problem_is_exported_with_its_numbers(tmp_path: Path) -> None:
     compiled = torchgco.compile(car(), "interior_point", changes=["x0", "x_ref", "R"], receding=True)
     compiled.numbers["R"] = [[0.3, 2.0]]

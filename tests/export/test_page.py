@@ -38,6 +38,7 @@ def test_the_firmware_of_the_page_compiles(folder: Path, tmp_path: Path) -> None
     said("gcc", *STRICT, f"-I{folder}", "-c", tmp_path / "firmware.c", "-o", tmp_path / "firmware.o", folder=folder)
 
 
+@pytest.mark.slow
 @needs("gcc", "g++")
 def test_the_node_of_the_page_steers(folder: Path, tmp_path: Path) -> None:
     """With stubs of rclcpp, which deliver a message of each kind and let three periods pass."""
@@ -59,6 +60,7 @@ def planned(layout: int) -> Problem:
     return setup.vehicle.task(setup.layouts().take(np.array([layout]))).problem
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_controller_of_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     target = tmp_path / "boat"
     words = [*WORDS, "--c", "boat", "--output", str(target), "--layout", "1", "--changes", "centers"]

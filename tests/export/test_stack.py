@@ -42,6 +42,7 @@ def longest(graph: str, entry: str) -> int:
     return deepest(entry, ())
 
 
+@pytest.mark.sampled(1)
 @needs("gcc")
 @pytest.mark.parametrize("kind", mostly([*PROBLEMS, *LONG], "linear", "ellipsoids", "dense"))
 def test_a_step_takes_at_most_the_stack_that_the_page_says(kind: str, tmp_path: Path) -> None:

@@ -59,6 +59,7 @@ def pair(folder: Path, period: float = DT, problem: Problem | None = None) -> tu
     return load_c(folder, period=period), mpc
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("push", [0.0, 0.02])
 @pytest.mark.parametrize("period", [DT, 0.5 * DT, 0.17])
 def test_200_periods_have_the_bits_of_python(folder: Path, period: float, push: float) -> None:
@@ -72,6 +73,7 @@ def test_200_periods_have_the_bits_of_python(folder: Path, period: float, push: 
         x = plant(x, u.numpy(), period) + push * draws.standard_normal(4)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::torchgco.StartWarning", "ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("seed", [0, 1])
 def test_pushed_into_discs_it_solves_what_python_solves_from_plans(folder: Path, seed: int) -> None:
@@ -177,6 +179,7 @@ def test_numbers_that_the_problem_cannot_have_are_refused(folder: Path, name: st
     assert c.status == Status.CONVERGED
 
 
+@pytest.mark.slow
 def test_from_a_saddle_point_it_goes_on_beside(tmp_path: Path) -> None:
     """On the top between two valleys staying fulfils the conditions of first order, and neither C nor Python stays."""
     hill = lambda x: (x[..., 0].square() - 1.0).square()
@@ -189,6 +192,7 @@ def test_from_a_saddle_point_it_goes_on_beside(tmp_path: Path) -> None:
     assert mpc.answer is not None and c.workspace.iterations == int(mpc.answer.iterations[0])
 
 
+@pytest.mark.slow
 def test_a_plan_can_be_without_a_receding_horizon(tmp_path: Path) -> None:
     folder = torchgco.export_c(discs(), tmp_path, name="sweep", receding=False)
     c, compiled = load_c(folder), torchgco.compile(discs(), "interior_point")

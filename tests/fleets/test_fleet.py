@@ -121,6 +121,7 @@ class Bare:
         self.U = U
 
 
+@pytest.mark.slow
 def test_different_vehicles_distances_and_obstacles() -> None:
     """A slow one with drag, one that nobody minds, a wall with a door, and something that moves."""
 

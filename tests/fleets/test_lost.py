@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 import torchgco
@@ -9,6 +10,7 @@ from tests.fleets.scenes import disc
 from torchgco import Fleet, FleetSolution, Spheres
 
 
+@pytest.mark.slow
 def test_a_start_that_is_not_finite_is_lost_alone() -> None:
     nan = float("nan")
     members = [disc([[0, 0], [0, 0]], [[4, 0], [4, 0]]), disc([[4, 0], [nan, 0]], [[0, 0.1], [0, 0.1]])]

@@ -65,6 +65,7 @@ def test_a_terminal_equality_and_its_multipliers_against_the_dense_kkt_system(n:
     assert float(certify(problem, solution.X, solution.U).kkt_residual.max()) < 1e-7
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("n, m, N", [(2, 1, 8), (4, 2, 20), pytest.param(8, 4, 40, marks=pytest.mark.slow)])
 def test_bounds_and_half_spaces_against_an_exact_quadratic_program(n: int, m: int, N: int) -> None:
     lq = LinearQuadratic(n, m, N)

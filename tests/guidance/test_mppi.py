@@ -32,6 +32,7 @@ def white_noise(problem, key_: DrawKey, samples: int, native: bool) -> np.ndarra
     return z.unflatten(0, (problem.N, problem.m)).permute(2, 3, 0, 1).numpy()
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("saturation", ["bounds", "symmetric"])
 @pytest.mark.parametrize("batch", BATCHES)
 def test_improve_equals_algorithm_3(batch: str, saturation: str, native: bool, monkeypatch) -> None:
@@ -67,6 +68,7 @@ def through_the_obstacles(problem):
     return X
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_detection_and_region_equal_algorithm_5(batch: str, native: bool) -> None:
     problem, U = BATCHES[batch](B=4, N=30, obstacles=14)

@@ -110,6 +110,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", mostly(CASES, *set(CASES) - {"a product with float64"}))
 def test_available_guidance_is_used(case: str, in_pytorch: None) -> None:
     """The caught problem is guided, the other is not; each is solved as if alone. Lost parts give one warning."""

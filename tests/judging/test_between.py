@@ -69,6 +69,7 @@ def dense_clearance(problem: Problem, U: np.ndarray, lengths: Any) -> np.ndarray
     return least
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("speed", [0.0, SPEED])
 def test_clearance_is_that_of_the_path(speed: float) -> None:
     """Chords of stages of 0.3 s are off by up to 7 cm at 6 m/s^2."""
@@ -82,6 +83,7 @@ def test_clearance_is_that_of_the_path(speed: float) -> None:
     assert max(off) < 1.1e-3, off
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("speed", [0.0, SPEED])
 def test_clearance_in_the_form_for_solvers_is_that_of_the_path(speed: float) -> None:
     """How deep it is, of horizons that differ and of bounded rates, which make states of the controls before."""
@@ -98,6 +100,7 @@ def test_clearance_in_the_form_for_solvers_is_that_of_the_path(speed: float) -> 
     assert max(off) < 1.1e-3 and touching > 2, off
 
 
+@pytest.mark.slow
 @compiled
 def test_clearance_in_free_time_is_that_of_the_path() -> None:
     fixed = scene(7, B=3)
@@ -108,6 +111,7 @@ def test_clearance_in_free_time_is_that_of_the_path() -> None:
     np.testing.assert_allclose(verdict.clearance.numpy(), exact, atol=1.1e-3)
 
 
+@pytest.mark.sampled(1)
 @compiled
 @pytest.mark.parametrize("solver", ["gco", "interior_point", "al_ilqr"])
 def test_statuses_say_what_the_judge_does(solver: str) -> None:
@@ -204,6 +208,7 @@ def test_a_body_that_turns_within_a_stage_is_followed() -> None:
     assert float(verdict.clearance_knots) > 0.2 and float(verdict.clearance) < 0.0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("share", [0.96, 0.98])
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 @compiled

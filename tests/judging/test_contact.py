@@ -1,6 +1,7 @@
 """Where pictures mark contact: there and only there where the judge finds it."""
 
 import numpy as np
+import pytest
 import torch
 
 from torchgco import Boxes, Field, FunctionDynamics, OccupancyGrid, Problem, QuadraticCost, Spheres, judge
@@ -24,6 +25,7 @@ def task(paths: np.ndarray) -> Problem:
     return Problem(dynamics, cost, parts, torch.from_numpy(paths[:, 0]), paths.shape[1] - 1)
 
 
+@pytest.mark.slow
 def test_contact_is_marked_where_and_only_where_the_judge_finds_it() -> None:
     rng = np.random.default_rng(0)
     paths = np.cumsum(np.concatenate((rng.uniform(-1, 1, (24, 1, 2)), rng.normal(0, 0.12, (24, N, 2))), axis=1), axis=1)

@@ -50,6 +50,7 @@ def sampled_clearance(problem: Problem, X: np.ndarray, b: int, per_segment: int 
     return at, between
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_judged_by_numpy(batch: str) -> None:
     problem, U = BATCHES[batch](B=3, N=20)

@@ -37,6 +37,7 @@ def boxed_problem(d: int, N: int = 8, rounded: bool = False) -> tuple[Problem, B
     return problem, boxes, (centers, half, rotations, radii)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("rounded", mostly([False, True], False))
 @pytest.mark.parametrize("d", [2, 3])
 def test_clearances_against_sampled_segments(d: int, rounded: bool) -> None:

@@ -133,6 +133,7 @@ def test_the_cost_tells_of_steps_that_no_state_tells_of(seed: int) -> None:
     assert not bool(errors.large[(wrong < 0.007) & (errors.step_error < 0.1)].any())
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("integrator", ["euler", "implicit_euler"])
 def test_costs_that_euler_steps_change_by_over_one_per_cent_are_told(integrator: str) -> None:
     """Twice the step cost is the error, to first order; beyond rate dt = 2 Euler's steps explode."""
@@ -153,6 +154,7 @@ def test_costs_that_euler_steps_change_by_over_one_per_cent_are_told(integrator:
     assert missed == 0 and off >= 16 and false <= 2 and right >= 32
 
 
+@pytest.mark.slow
 def test_the_error_of_eulers_steps_is_said_but_not_of_published_ones() -> None:
     few = torch.tensor([0, 1, 2, 3])
     with pytest.warns(StepWarning, match="^Euler's steps change the costs of . of 4 .*=.rk4., or a smaller dt"):
@@ -278,6 +280,7 @@ def test_free_times_horizons_rates_and_stages_count(kind: str) -> None:
     assert bool((found.step_cost > 1e-7).all())
 
 
+@pytest.mark.slow
 def test_given_multipliers_count_what_a_row_costs() -> None:
     """A required end: the cost of the controls alone hardly changes, that of arriving does."""
     field = lambda x, u: torch.stack((x[..., 1], u[..., 0] - 2.0 * x[..., 0].sin()), dim=-1)

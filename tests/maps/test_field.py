@@ -43,6 +43,7 @@ def points_around(grid: OccupancyGrid, count: int, seed: int = 1, beyond: float 
     return rng.uniform(grid.origin - beyond, grid.upper + beyond, (count, grid.d))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("refine", [1, 2, 3])
 @pytest.mark.parametrize("d", [2, 3])
 def test_nodes_have_the_exact_distances(d: int, refine: int) -> None:

@@ -137,6 +137,7 @@ def test_a_mission_rolls_through_a_slot_that_hits_what_flies_level() -> None:
     assert int(blind.steps()[0]) == math.ceil(end.flight_time / 0.05 - 1e-9), "the simulation has seen it, too"
 
 
+@pytest.mark.slow
 def test_plans_keep_the_body_in_all_their_parts_and_missions_do_not_depend_on_others() -> None:
     problem = among(slot(FLAT, HALF, TILT), B=2)
     x = hovering(problem.dynamics.airframe, problem.x0[:, :3])  # type: ignore[attr-defined]

@@ -72,6 +72,7 @@ def test_distances_are_those_by_hand_at_an_instant_and_along_the_way(kind: str) 
 BLIND = replace(SOLVER, initial_penalty=1e-12, max_outer_iterations=1)  # obstacles cost it next to nothing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", mostly(KINDS, "sphere", "box", "trunk", "turned box"))
 def test_a_mission_flies_around_obstacles_of_every_kind_and_sees_contact_with_them(kind: str) -> None:
     problem, radius = among(KINDS[kind]), torch.tensor([0.6], **DOUBLE)

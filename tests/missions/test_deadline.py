@@ -68,6 +68,7 @@ def test_a_limit_that_is_not_reached_changes_no_bit(name: str, clock: list[int])
     assert clock
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["restarts", "multistart"])
 def test_attempts_stop(name: str, clock: list[int]) -> None:
     """The more time, the more passes; all in all fewer than without a limit."""

@@ -75,6 +75,7 @@ def six() -> tuple[Problem, Mission]:
     return problem, mission(duration=0.3, plant=plant, goal_radius=None)
 
 
+@pytest.mark.slow
 def test_every_end_by_construction() -> None:
     problem, flown = six()
     seen: list[tuple[int, int]] = []
@@ -95,6 +96,7 @@ def test_every_end_by_construction() -> None:
     assert [flying for _, flying in seen] == [sum(n > k + 1 or n == 6 for n in steps.values()) for k in range(6)]
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_ends_changes_no_other() -> None:
     problem, flown = six()
     whole = flown.fly(problem)
@@ -129,6 +131,7 @@ def disturbed(B: int = 4) -> tuple[Problem, Mission]:
     return varied(B, moving=True), mission(duration=0.3, plant=plant, disturbance=disturbance, planner=planner)
 
 
+@pytest.mark.slow
 def test_a_mission_has_the_same_bits_in_any_batch_and_order() -> None:
     problem, flown = disturbed()
     whole = flown.fly(problem, seed=5)
@@ -279,6 +282,7 @@ def on_the_moon(airframe: Airframe) -> Problem:
     return replace(there, dynamics=QuadrotorPlanning(dt=DT, airframe=airframe), cost=cost, x0=rest.repeat(1, 1))
 
 
+@pytest.mark.slow
 def test_a_mission_flies_where_it_is_planned() -> None:
     """On the moon plans, tracker and plant weigh a sixth: the plant goes where the first plan leads."""
     moon = Airframe(gravity=1.62)

@@ -32,6 +32,7 @@ def test_it_flies_through_forests(airframe: Airframe, count: int) -> None:
     assert bool(((low - 1e-9 <= F) & (high + 1e-9 >= F) | F.isnan()).all())
 
 
+@pytest.mark.slow
 def test_one_key_of_a_command_and_the_same_in_python() -> None:
     setup = compose(["experiment=mission", "vehicle.mass=1.2", "vehicle.radius=0.3"])
     task = Vehicle.quadrotor(Airframe(mass=1.2, radius=0.3)).among(FORESTS, [0])

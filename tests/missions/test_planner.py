@@ -90,6 +90,7 @@ def test_the_first_plan_is_the_solvers_own_solution() -> None:
     assert not bool(biased.bias.any())
 
 
+@pytest.mark.slow
 def test_plans_are_not_finished_beyond_the_limits_of_the_solver(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a limit cuts off, the next plan continues: longer limits would only make this one late."""
     made = []

@@ -65,6 +65,7 @@ def random_states(B: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
     return x, FRAME.hover_speed + 300.0 * u, force
 
 
+@pytest.mark.sampled(1)
 @each_plant
 def test_the_quaternion_keeps_its_length_and_thrusts_their_limits(make) -> None:
     x, _, _ = random_states(5)
@@ -113,6 +114,7 @@ def test_hover_holds(make) -> None:
     assert (flown - flown[0]).abs().max() < 1e-10
 
 
+@pytest.mark.sampled(1)
 @each_plant
 def test_half_the_time_step_leaves_a_sixteenth_of_the_error(make) -> None:
     x, _, force = random_states(3)
@@ -158,6 +160,7 @@ def test_a_heavier_vehicle_falls(make) -> None:
     torch.testing.assert_close(flown[:, 2], acceleration * t * t / 2, rtol=1e-9, atol=0)
 
 
+@pytest.mark.sampled(1)
 @each_plant
 def test_better_rotors_lift_more(make) -> None:
     errors = torch.tensor([0.1, -0.2], dtype=DOUBLE)
@@ -199,6 +202,7 @@ def test_the_body_turns_against_rotors_that_speed_up(make) -> None:
     torch.testing.assert_close(own, rotors, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 @needs_drone_models
 def test_the_plants_agree_on_a_hover() -> None:
     """Measured 4e-16."""

@@ -72,6 +72,7 @@ def controls(problem: Problem) -> Tensor:
     return torch.tensor([0.0, 0, 0, 9.81], **DOUBLE).repeat(problem.B, problem.N, 1)
 
 
+@pytest.mark.sampled(2)
 @needs_compiler
 @pytest.mark.parametrize("bias", [None, 0.5])
 @pytest.mark.parametrize("B", [1, 3])
@@ -151,6 +152,7 @@ def dragged(drag: Any, B: int = 3) -> Problem:
 DRAG = torch.tensor([4.0, 9.0, 13.0], **DOUBLE)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_parameter_per_problem_has_the_same_bits_alone_and_repeated() -> None:
     whole = dragged(DRAG)

@@ -143,6 +143,7 @@ CASES = {
 FREE = list(CASES)[:3]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore:Values in x were outside bounds:RuntimeWarning")  # of SLSQP before SciPy 1.16
 @pytest.mark.parametrize(
     ("name", "tracker"),

@@ -62,6 +62,7 @@ def test_values_and_expansions_are_pytorchs(d: int, names: tuple[str, ...], phr:
     torch.testing.assert_close(measured(problem, X, U, obstacles=True), deepest, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "solver", [AugmentedLagrangian(max_outer_iterations=6), InteriorPoint(max_iterations=30)], ids=["al", "ip"]
 )

@@ -122,6 +122,7 @@ def test_rows_without_room_stay_out() -> None:
     torch.testing.assert_close(eager.cost, native.cost, rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_no_problem_depends_on_the_others() -> None:
     """Bit by bit: alone, in parts, in another order, beside one that fails."""
     problem = cart(4, x0=torch.tensor([[0.0, 0.0], [0.3, 0.5], [0.0, 3.0], [-1.0, 0.2]], dtype=D))
@@ -179,6 +180,7 @@ class Branches(torch.nn.Module):
         return torch.stack((x[..., 0] + 0.2 * x[..., 1], x[..., 1] + gain * 0.2 * torch.tanh(u[..., 0])), dim=-1)
 
 
+@pytest.mark.slow
 def test_code_that_cannot_be_traced_is_solved_by_the_interior_point() -> None:
     model = FunctionDynamics(Branches(), 2, 1, 0.2, "none")
     cost = QuadraticCost([0.1, 0.1], [0.01], [90.0, 9.0], [1.0, 0.0])

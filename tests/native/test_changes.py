@@ -47,6 +47,7 @@ def made(drag: Drag) -> Problem:
     return Problem(FunctionDynamics(field, 4, 2, 0.1), COST, [], X0, N)
 
 
+@pytest.mark.sampled(21)
 @pytest.mark.parametrize("name", [*INPUTS, *CODE])
 def test_a_change_is_seen(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     drag, change = (INPUTS | CODE)[name]()

@@ -187,6 +187,7 @@ def at_once(barrier, results) -> None:
     results.put((times(2), times(3)))
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_eight_processes_at_once(cache: Path, compiled: list[str]) -> None:
     context = multiprocessing.get_context("fork")
@@ -242,6 +243,7 @@ def alive(number: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc")
 @pytest.mark.parametrize("how", mostly([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
 @pytest.mark.parametrize("late", mostly([False, True], True), ids=["while it runs", "before Python goes on"])
@@ -307,6 +309,7 @@ def test_zig(monkeypatch) -> None:
 
 
 # What the extra `native` promises: whole kernels, not only a line of C.
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("command", ["clang", f"{sys.executable} -m ziglang cc"])
 def test_clang_and_zig_compile_the_kernels(monkeypatch, command: str) -> None:
     monkeypatch.setenv("TORCHGCO_CC", command)

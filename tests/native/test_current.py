@@ -86,6 +86,7 @@ BASE = Problem(Boat(), WEIGHTS, [ControlBounds(-3, 3)], X0, N)
 SPEED = [FunctionConstraint(lambda x: x[..., 2:3] - 1.0)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("base", "change"),
     [
@@ -153,6 +154,7 @@ READ: dict[str, Callable[[Memory, Tensor], Tensor]] = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("place", "kind"),
     [*(("dynamics", kind) for kind in READ), ("cost", "number"), ("cost", "tensor"), ("constraint", "array")],

@@ -103,6 +103,7 @@ def test_each_field_lies_where_python_writes_it(folder: Path, name: str, header:
     assert set(header.made) == set(header._fields)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("folder", "flags"),
     [(C, []), (C, ["-UDIM", "-DDIM=0"]), (roadmap.C, []), (roadmap.C, ["-UBOXES", "-DBOXES=0"]), (SENSING, [])],
@@ -299,6 +300,7 @@ OF_ROADMAP = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", mostly(OF_ROADMAP, "TIE", "HOPS"))
 def test_a_constant_of_the_roadmap_changes_both_searches(name: str, monkeypatch) -> None:
     usual = searched()

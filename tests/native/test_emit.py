@@ -127,6 +127,7 @@ def test_single_precision(name: str) -> None:
     np.testing.assert_allclose(emitted(x, y)[0], expected, rtol=1e-6, atol=1e-30)
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", [*EXACT, *CLOSE])
 @pytest.mark.parametrize("lanes", mostly([1, 4, 16], 1))
 def test_lanes_do_not_affect_each_other(name: str, lanes: int) -> None:

@@ -176,6 +176,7 @@ def natively(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> P
     return kernels_of(lagrangian.problem).descend(lagrangian, state, inner.descent, count)
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("phr", mostly([True, False], False), ids=["phr", "printed"])
 @pytest.mark.parametrize("guided", [None, "region", "path"])
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -213,6 +214,7 @@ def test_gains_and_optimality_are_pytorchs(name: str) -> None:
     torch.testing.assert_close(native.left, plain.left, rtol=1e-8, atol=0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("mu_r", [0.0, 0.7])
 def test_a_regularised_backward_pass_expects_pytorchs_change(mu_r: float) -> None:
     problem = quadrotor_batch(B=5, N=15, obstacles=5)[0]
@@ -227,6 +229,7 @@ def test_a_regularised_backward_pass_expects_pytorchs_change(mu_r: float) -> Non
         torch.testing.assert_close(mine.expected_change(steps), want.expected_change(steps), rtol=1e-9, atol=0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("n", "m", "N"), [(1, 1, 1), (2, 3, 4), (5, 1, 9), (20, 20, 3), (13, 4, 1), (40, 3, 2)])
 def test_models_of_any_size(n: int, m: int, N: int) -> None:
     problem = linear_problem(n, m, N)

@@ -248,6 +248,7 @@ def length_of(step: Array, moved: Array, longest: float) -> float:
     return longest / 2 ** round(halvings)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("warm", mostly([False, True], True), ids=["cold", "warm"])
 @pytest.mark.parametrize(
     "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.slow) for name in MAKERS]
@@ -286,6 +287,7 @@ def assert_same(point: Point, w: Array, multipliers: tuple[Array, Array], mu: fl
         np.testing.assert_allclose(point.scale * mine, theirs, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.sampled(1)
 def test_rows_without_room_take_the_steps_of_the_problem_without_them() -> None:
     """Bounds that coincide are equalities; a tight bound on the start and constant rows have no part in any step."""
     given, plain = with_rows_without_room(3)

@@ -182,6 +182,7 @@ def shared(model: FunctionDynamics) -> Tensor:
     return numbers
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", mostly(CASES, "expressions", "activations", "many states"))
 def test_derivatives_are_those_of_autodiff(name: str) -> None:
     make, integrator = CASES[name]

@@ -92,7 +92,7 @@ def points(model: Dynamics, kind: str) -> tuple[Tensor, Tensor]:
     return x, u
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(3)
 @needs_compiler
 @pytest.mark.parametrize("name", mostly(MODELS, *LARGE))
 def test_steps_and_derivatives(name: str) -> None:

@@ -74,6 +74,7 @@ def both(monkeypatch: pytest.MonkeyPatch, solve: Callable[[], SolveEnd]) -> tupl
     return native, solve()
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("stops", mostly([False, True], True))

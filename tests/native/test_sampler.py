@@ -113,7 +113,7 @@ def test_the_noise_is_that_of_pytorch() -> None:
     assert abs(float(made.mean())) < 0.02 and abs(float(made.var()) - 1.0) < 0.02
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("sampler", SAMPLERS)
 @pytest.mark.parametrize("made", PROBLEMS)
 def test_rounds_equal_those_of_pytorch(made: str, sampler: str, monkeypatch) -> None:

@@ -40,7 +40,7 @@ def blocks(slopes: Tensor, curvatures: Tensor) -> Tensor:
     return torch.cat((slopes.unsqueeze(-1), curvatures.triu()), dim=-1)
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("unit", mostly([False, True], True), ids=["as it is", "in cost units"])
 @pytest.mark.parametrize("name", mostly(PROBLEMS, *list(PROBLEMS)[1::2]))
 def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> None:
@@ -68,7 +68,7 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
         assert [bool(x) for x in out.converged] == [ends[i][0] for i in range(problem.B)]
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_unit_of_cost_is_pytorchs(name: str) -> None:
     problem, same = PROBLEMS[name](), PROBLEMS[name]()
@@ -170,6 +170,7 @@ def test_steps_in_states_and_controls_together_are_pytorchs() -> None:
     assert not bool(none.accepted.any()) and torch.equal(none.X, X) and torch.equal(none.U, state.U)
 
 
+@pytest.mark.slow
 def test_solve_is_native_for_a_users_own_car_and_cost() -> None:
     problem = errands()
     with warnings.catch_warnings():

@@ -340,6 +340,7 @@ def by_hand(x: np.ndarray) -> np.ndarray:
     return np.stack((p + along(yaw, 0.2), p + along(yaw, -0.2), axle, post + along(swing, 0.15), tip))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_parts_are_where_their_hinges_and_angles_put_them(kind: str) -> None:
     problem = jointed(kinds(2)[kind])

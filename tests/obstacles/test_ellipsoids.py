@@ -72,6 +72,7 @@ def at_known_distances(part: BoundEllipsoids, d: int, gap: float, count: int) ->
     return local @ part.axes[:, 0] + part.centers[:, :1]
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("gap", [-0.105, -0.1, -0.05, 0.0, 0.3, 20.0])  # the first is inside of the ellipsoid itself
 def test_distances_and_rows_of_points_at_known_distances(d: int, gap: float) -> None:

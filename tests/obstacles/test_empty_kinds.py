@@ -77,7 +77,7 @@ def problem_of(constraints: list[Any]) -> Problem:
 DRAWS = [*((seed, "native") for seed in range(8)), (2, "eager"), (7, "eager")]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")
 @pytest.mark.parametrize(("seed", "native"), mostly(DRAWS, *DRAWS[4:], several=True), indirect=["native"])
 def test_an_empty_kind_changes_no_bit(seed: int, native: bool) -> None:
@@ -98,6 +98,7 @@ def test_an_empty_kind_changes_no_bit(seed: int, native: bool) -> None:
             assert torch.equal(getattr(a, field.name), getattr(b, field.name)), field.name
 
 
+@pytest.mark.slow
 def test_oscillating_boxes_and_maps_that_hold_nothing() -> None:
     """These are searched otherwise than no obstacle is; the answer is as good."""
     few = [PRESENT["boxes"], ROWS["states"]]

@@ -166,6 +166,7 @@ def crossing(N: int = 40, B: int = 1, **more: Any) -> Problem:
     return among(Moved(np.stack([comes, leaves], 1), 0.3, 0.1), B=B, N=N, **more)
 
 
+@pytest.mark.slow
 def test_solves_are_judged_and_certified_and_keep_the_batch_contract() -> None:
     B = 6
     path = ways(2, B, 4, 40, seed=5)
@@ -190,6 +191,7 @@ def test_one_that_crosses_at_high_speed_is_seen_between_the_knots() -> None:
     assert float(part_of(problem).clearances(X)[0]) > 1.0 and float(part_of(problem).clearances(X)[1]) < 0
 
 
+@pytest.mark.slow
 def test_horizons_free_time_and_bodies() -> None:
     both = crossing(B=2, horizon=[30, 40])
     for solver in ("gco", "interior_point"):
@@ -206,6 +208,7 @@ def test_horizons_free_time_and_bodies() -> None:
     assert bool(judge(problem, solution.U).reached.all())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("body", [False, True])
 @pytest.mark.parametrize("boxes", [False, True])
 def test_new_places_between_solves(boxes: bool, body: bool) -> None:

@@ -149,6 +149,7 @@ def test_problems_keep_their_bits_and_absent_boxes_count_nowhere() -> None:
     assert bool(torch.isfinite(judge(problem, U).clearance).all())
 
 
+@pytest.mark.slow
 def test_a_problem_among_them_is_solved() -> None:
     import torchgco
 

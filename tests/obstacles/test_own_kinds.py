@@ -155,6 +155,7 @@ def level(x: Tensor) -> Tensor:
     return torch.eye(3, dtype=x.dtype).expand(*x.shape[:-1], 3, 3)
 
 
+@pytest.mark.slow
 def test_it_is_met_by_a_body_and_ends_with_each_horizon() -> None:
     long = Body([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]], [0.1, 0.1], level)
     for problem in (flight(False, body=long), flight(False, horizon=[50, 40, 35])):

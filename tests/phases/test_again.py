@@ -51,6 +51,7 @@ CHANGES: dict[str, Callable[[Numbers], Any]] = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_has_changed_counts(change: str) -> None:
     numbers = Numbers()

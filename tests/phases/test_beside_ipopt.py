@@ -21,6 +21,7 @@ QUICK = "bouncing ball", "two-burn orbit raise"
 PUBLISHED = {"two-burn orbit raise": (0.3995, 1e-3), "Delta III": (-7.529712, 1e-3)}  # cost, and share for other steps
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
 )
@@ -66,6 +67,7 @@ def test_steps_of_phases_are_judged_by_the_slopes_of_all() -> None:
     torch.testing.assert_close(mine.step_cost, theirs.step_cost, rtol=1e-6, atol=0.0)
 
 
+@pytest.mark.slow
 def test_steps_that_are_too_long_are_named() -> None:
     with pytest.warns(StepWarning, match="steps that are too long"):
         torchgco.solve(oscillating(0.4))

@@ -103,6 +103,7 @@ def losses(solution: PhasesSolution) -> Tensor:
     return torch.stack([*own, *costs, solution.begins.square().sum(), solution.found.U.sum(), sum(rows)])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_gradients_are_differences(name: str, seed: int) -> None:

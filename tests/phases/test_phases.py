@@ -83,6 +83,7 @@ def bounces(height: float, B: int = 1) -> Phases:
     return Phases([arc(ground, free_start=[False, True]), arc(ground), arc(top)], [bounce, bounce])
 
 
+@pytest.mark.slow
 def test_a_ball_is_shot_so_that_it_reaches_a_height_after_two_bounces() -> None:
     solution = solved(bounces(0.5))
     launch = math.sqrt(2.0 * G * 0.5) / 0.81
@@ -93,6 +94,7 @@ def test_a_ball_is_shot_so_that_it_reaches_a_height_after_two_bounces() -> None:
     torch.testing.assert_close(solution[1].X[:, 0, 1], -0.9 * solution[0].X[:, -1, 1], rtol=1e-12, atol=0.0)
 
 
+@pytest.mark.slow
 def test_two_impulses_at_free_times_are_hohmanns() -> None:
     from benchmarks.families.phases_problems import impulses
 
@@ -135,7 +137,7 @@ ROWS: dict[str, Callable[[], list[Constraint]]] = {
 }
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ROWS)
 def test_rows_of_a_second_phase_are_those_of_its_problem(kind: str) -> None:
     """The first phase stays where the second begins, so that this one alone has something to choose."""
@@ -161,6 +163,7 @@ def test_goals_and_other_sizes() -> None:
     torch.testing.assert_close(found[1].X[:, -1], torch.full((1, 2), 2.0, dtype=D), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_links_between_phases_leave_the_rest_to_the_solver() -> None:
     one, other = drive([0.0] * 4, [1.0, 0.0]), drive([1.0, 0, 0, 0], [2.0, 0.0], model=HEAVY)
     same, linked = solved(Phases([one, other])), solved(Phases([one, other], [Link()]))
@@ -172,6 +175,7 @@ def test_links_between_phases_leave_the_rest_to_the_solver() -> None:
     assert float((apart[0].X[0, -1, :2] - apart[1].X[0, 0, :2]).norm()) == pytest.approx(0.2, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_lap_of_two_phases_is_closed() -> None:
     """As one problem with a Link is, where both phases have the same model."""
     wave = 0.2 * torch.arange(25, dtype=D)
@@ -192,6 +196,7 @@ def test_a_lap_of_two_phases_is_closed() -> None:
         Phases(parts, loop=3)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_problem_does_not_depend_on_its_batch() -> None:
     starts = torch.tensor([[0.0, 0, 0, 0], [0.2, 0.3, 0, 0], [-0.5, 0.1, 1, 0]], dtype=D)
     gains = torch.tensor([0.2, 0.5, 0.9], dtype=D)
@@ -206,6 +211,7 @@ def test_a_problem_does_not_depend_on_its_batch() -> None:
             assert torch.equal(mine.t.expand(len(rows), -1), theirs.t.expand(3, -1)[rows])
 
 
+@pytest.mark.slow
 def test_a_bad_element_ends_by_itself() -> None:
     starts = torch.tensor([[0.0, 0, 0, 0], [0.0, 0, 1, 0]], dtype=D)
     lost, problem = {"lost": torch.tensor([1.0, 0.0], dtype=D)}, drive(starts, [1.0, 0.0])
@@ -255,6 +261,7 @@ def test_single_precision() -> None:
     torch.testing.assert_close(solution.cost.double(), solved(double).cost, rtol=1e-5, atol=0.0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_a_loop_has_numbers_in_single_precision(seed: int) -> None:
     """The judge refused them."""

@@ -45,6 +45,7 @@ def driven() -> tuple[Phases, PhasesSolution]:
     return phases, torchgco.solve(phases)
 
 
+@pytest.mark.slow
 def test_a_figure_has_the_phases_in_their_order_and_marks_the_jumps() -> None:
     phases, solution = driven()
     figure = torchgco.plot(phases, solution, b=1)
@@ -62,6 +63,7 @@ def test_a_figure_has_the_phases_in_their_order_and_marks_the_jumps() -> None:
     assert f"problem 1: CONVERGED, cost {float(solution.cost[1]):.6g}" in texts and "the next phase begins" in texts
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["take-off to cruise", "bouncing ball"])
 def test_phases_of_other_sizes_and_without_a_position_are_drawn_over_time(name: str) -> None:
     phases = CASES[name].phases(2)
@@ -97,6 +99,7 @@ def test_a_certificate_of_all_phases_sees_each_mistake() -> None:
     assert float(torchgco.certify(phases, replace(solution, found=pushed)).kkt_residual.min()) > 1e-3
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["two impulses", pytest.param("Delta III", marks=pytest.mark.slow), "gears"])
 def test_free_times_and_impulses_are_stationary(name: str) -> None:
     case = CASES[name]
@@ -107,6 +110,7 @@ def test_free_times_and_impulses_are_stationary(name: str) -> None:
     assert float(certificate.step_error.max()) < 1e-3
 
 
+@pytest.mark.slow
 def test_free_starts_links_and_loops_are_stationary_and_some_are_asked_for() -> None:
     hop = bounces(0.5, B=2)
     asked = torch.tensor([False, True])

@@ -35,7 +35,7 @@ def changes_in(path: Path) -> list[int]:
     return [int(np.abs(a - b).sum()) for a, b in pairwise(pictures)]
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("others", [(), (Ellipsoids([[0.5, 1.0]], [[0.1, 0.2]], 0.1, [0.3], [[0.0, -0.5]]),)])
 def test_a_film_shows_what_moves(others: tuple[object, ...], tmp_path: Path) -> None:
     stated = problem(MOVING, *others)
@@ -60,6 +60,7 @@ def test_obstacles_and_vehicles_are_where_they_are_then() -> None:
         np.testing.assert_allclose(vehicle.center, way, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_notebook_plays_it_with_a_body() -> None:
     body = Body.covering([-0.2, -0.1], [0.2, 0.1], [2, 1])
     model = torchgco.Unicycle(dt=0.1)

@@ -49,6 +49,7 @@ def test_a_mission_plays_in_real_time_and_stands_at_its_end(tmp_path: Path) -> N
     assert all(changed(a, b) > 20 for a, b in pairwise(found))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("steps", [20, 30, 31, 100])
 def test_a_long_mission_has_few_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     assert animation.MAX_FRAMES == 100

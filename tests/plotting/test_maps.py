@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -124,6 +125,7 @@ def planned() -> Problem:
     return Problem(dynamics, cost, [Field(OccupancyGrid(cells(), [0, 0], 0.1), RADIUS)], x0, N, Goal([11.0, 3.0], 0.3))
 
 
+@pytest.mark.slow
 def test_plots_and_pages_of_a_problem_do_the_same() -> None:
     problem, X = planned(), torch.from_numpy(PATHS)
     found = solution(problem, X)
@@ -155,6 +157,7 @@ def test_maps_of_their_own_share_a_legend() -> None:
     assert not any("unknown" in word for word in words(figure)) and blue(figure) == 0
 
 
+@pytest.mark.slow
 def test_pictures_of_missions_do_the_same(tmp_path: Path) -> None:
     room = np.repeat(cells()[:, :, None], 20, axis=2)
     field = DistanceField.of(OccupancyGrid(room, [0.0, 0.0, -1.0], 0.1))

@@ -62,6 +62,7 @@ G = turned([1.0, 2.0, -1.0], 1.9)
 BOTH = torch.stack((G, -G, 3.0 * turned([0.0, 0.0, 1.0], -2.8)))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("solver", ["gco", "interior_point", "al_ilqr"])
 def test_both_signs_are_the_same_goal(solver: str) -> None:
     problem = satellites(BOTH)
@@ -78,6 +79,7 @@ def test_both_signs_are_the_same_goal(solver: str) -> None:
         assert bool((certify(problem, solution.X, solution.U).kkt_residual < 1e-4).all())
 
 
+@pytest.mark.slow
 def test_without_it_the_other_sign_is_a_longer_way() -> None:
     near, far = (float(torchgco.solve(satellites(BOTH[i : i + 1], None)).cost) for i in (0, 1))
     ours = torchgco.solve(satellites(BOTH[:2])).cost

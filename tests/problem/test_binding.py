@@ -207,6 +207,7 @@ def test_an_inherited_method_that_does_not_know_a_class_own_one_is_refused(field
     assert told.value.field == field.strip()
 
 
+@pytest.mark.slow
 @compiled
 def test_a_class_with_all_of_its_own_methods_is_solved() -> None:
     found, due = (
@@ -305,6 +306,7 @@ def test_what_a_class_leaves_out_is_named(field: str) -> None:
     assert told.value.field == field
 
 
+@pytest.mark.sampled(2)
 @compiled
 @pytest.mark.parametrize("solver", ["al_ilqr", "ilqr", "interior_point", "gco"])
 def test_rows_without_derivatives_of_their_own_are_differentiated(solver: str) -> None:

@@ -295,6 +295,7 @@ def test_references_follow_the_time(factors: tuple[float, float]) -> None:
     assert float(in_time(one).cost.total(lifted[1:], V[1:])) == pytest.approx(expected[1], rel=1e-12)
 
 
+@pytest.mark.slow
 @compiled
 def test_native_derivatives_of_references_are_autodiffs() -> None:
     user, draws = following(), torch.Generator().manual_seed(6)

@@ -82,6 +82,7 @@ def change(value: Any) -> None:
         value.flat[0] += 0.02
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("kind", mostly([as_tensor, as_array, as_list], as_list))
 @pytest.mark.parametrize("name", NUMBERS)
 def test_numbers_changed_in_place_are_those_of_the_next_solve(name: str, kind: Callable[[Tensor], Any]) -> None:
@@ -128,6 +129,7 @@ def test_other_sequences_of_numbers_are_followed_too(make: Callable[[list[float]
     assert torch.equal(torchgco.solve(kept, solver="interior_point").U, due.U)
 
 
+@pytest.mark.slow
 def test_a_list_of_constraints_is_followed() -> None:
     given = {key: make() for key, make in NUMBERS.items()}
     base = problem(given)
@@ -154,6 +156,7 @@ ROWS: dict[str, Callable[[], list[Any]]] = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", ROWS)
 @pytest.mark.parametrize("N", mostly([6, 25], 6))
 def test_parts_of_a_problem_are_bound_anew_to_another_one(kind: str, N: int) -> None:

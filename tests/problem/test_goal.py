@@ -83,6 +83,7 @@ def test_copies_of_a_problem_keep_its_goal() -> None:
     assert other.goal is None and not bool(has_arrived(other, ending(other, *[(1.0, 0.4)] * 3)).any())
 
 
+@pytest.mark.slow
 def test_a_terminal_function_with_a_goal_is_guided() -> None:
     problem, U0 = terminal_problem(Goal([1.0, 0.4], 0.15))
     assert scene_of(problem, U0) is not None

@@ -41,6 +41,7 @@ def cars(N: int, rows: slice, obstacles: bool, horizon: Any = None) -> Problem:
     return Problem(Unicycle(dt=0.1), cost, [*bounds, *moving], x0, N, horizon=horizon)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("solver", "obstacles"),
     [("gco", True), ("al_ilqr", True), ("al_ilqr", False), ("interior_point", True), ("interior_point", False)],
@@ -101,7 +102,7 @@ def of_user(parts: str, cost: str, N: int, rows: slice, horizon: Any = None) -> 
 ENDED = [("al_ilqr", "inequality"), *(("interior_point", name) for name in PARTS)]
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("solver", "parts"), mostly(ENDED, *(("interior_point", name) for name in list(PARTS)[::2]), several=True)
 )
@@ -148,7 +149,7 @@ def ends(kind: str, N: int, rows: slice, horizon: Any = None) -> Problem:
     return Problem(model, cost, constraints, x0, N, horizon=horizon)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["reference", "terminal cost", "terminal row"])
 def test_last_knots_have_numbers_of_their_own(kind: str) -> None:
     found = torchgco.solve(ends(kind, 10, slice(0, 2), [4, 7]), solver="interior_point")

@@ -117,7 +117,7 @@ def solved(problem: Problem, solver: Any) -> tuple[Solution, list[str]]:
 PARTS = "model", "stage", "end", "rows", "Model", "Stepped", "Price"
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("part", "guard", "solver"),
     [(part, GUARDS[i % 3], "al_ilqr") for i, part in enumerate(PARTS)]
@@ -151,6 +151,7 @@ def test_a_problem_alone_that_is_lost_says_so() -> None:
         assert not bool(torch.isfinite(certify(problem, found.X, found.U).kkt_residual))
 
 
+@pytest.mark.slow
 def test_a_guard_that_a_solve_crosses_on_its_way_costs_no_solution() -> None:
     """The guess is admitted, and so is the optimum; iterates between them may be refused."""
     rng = np.random.default_rng(0)

@@ -74,6 +74,7 @@ def test_derivatives_of_a_required_state_are_those_of_autodiff() -> None:
     torch.testing.assert_close(H, expected)
 
 
+@pytest.mark.sampled(1)
 @compiled
 @pytest.mark.parametrize(
     ("native", "parts"),
@@ -148,6 +149,7 @@ def test_models_without_a_position_take_states() -> None:
     torch.testing.assert_close(found.X[:, -1], torch.tensor([[torch.pi, 0.0]] * 2, dtype=D), atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 def test_one_out_of_reach_or_covered_is_infeasible_and_told() -> None:
     with pytest.warns(HorizonWarning, match="3 of 3 horizons are too short"):
         far = torchgco.solve(points(BALL, N=5))

@@ -132,6 +132,7 @@ def in_units(s: float, kind: str) -> Problem:
     return Problem(drag, cost, rows, s * x0, 8)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::torchgco.ScaleWarning")
 @pytest.mark.parametrize("kind", ["controls", "states", "rows of order 1", "norm"])
 @pytest.mark.parametrize("native", mostly([True, False], False))
@@ -154,6 +155,7 @@ def test_tolerances_that_are_large_beside_the_rows_are_named(kind: str) -> None:
         torchgco.solve(in_units(1e-6, kind), solver="al_ilqr")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("s", "constant"), [(1e-3, 1.0), (1e-3, 1e3), (1e-4, 1.0), (1e-4, 10.0)])
 def test_constants_hide_nothing_in_small_units_either(s: float, constant: float) -> None:
     base = in_units(s, "controls")
@@ -171,6 +173,7 @@ def test_constants_hide_nothing_in_small_units_either(s: float, constant: float)
     torch.testing.assert_close(own, due.cost, rtol=5e-3, atol=0)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("size", [1e6, 1e8, 1e9])
 @pytest.mark.parametrize("solver", ["gco", "interior_point", "gco_exact"])
 def test_equality_rows_in_small_units_hide_no_curvature_of_the_cost(solver: str, size: float) -> None:
@@ -192,6 +195,7 @@ def test_equality_rows_in_small_units_hide_no_curvature_of_the_cost(solver: str,
     assert found.statuses == [Status.CONVERGED] or (solver == "gco_exact" and size > 1e7)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", mostly([True, False], False))
 @pytest.mark.parametrize("units", [(1.0, 1e6), (1e-3, 1.0), (1e-3, 1e3)])
 def test_equality_rows_in_mixed_units_change_no_answer(units: tuple[float, float], native: bool) -> None:
@@ -253,6 +257,7 @@ def mixed(kind: str, states: Tensor, controls: Tensor) -> Problem:
     return Problem(model, cost, [rows], (x0 / states).unsqueeze(0), 15)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", mostly([True, False], False))
 @pytest.mark.parametrize("kind", ["states", "product"])
 @pytest.mark.parametrize("units", mostly([(1e4, 1.0), (1.0, 1e4), (1e3, 1e-3)], (1.0, 1e4), (1e3, 1e-3)))
@@ -271,6 +276,7 @@ def test_a_cost_is_scaled_by_the_sizes_of_its_variables(units: tuple[float, floa
         kernels.use_native(True)
 
 
+@pytest.mark.slow
 def test_constants_hide_no_cost_where_one_control_is_in_small_units() -> None:
     def problem(size: list[float], constant: float) -> Problem:
         units = torch.tensor(size, dtype=torch.float64)
@@ -287,6 +293,7 @@ def test_constants_hide_no_cost_where_one_control_is_in_small_units() -> None:
     assert bool((found.cost - 1e5 - expected).abs() < 1e-3 * expected)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("pressure", [1.0, 1e5, 1e7])
 @pytest.mark.parametrize("solver", ["gco", "al_ilqr"])
 def test_a_row_is_small_whatever_the_size_of_other_states(solver: str, pressure: float) -> None:

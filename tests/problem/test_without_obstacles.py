@@ -58,6 +58,7 @@ def planar(*constraints) -> tuple[Problem, torch.Tensor]:
     return Problem(problem.dynamics, problem.cost, constraints, problem.x0, problem.N), U0
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("kind", mostly(EMPTY, *list(EMPTY)[1::2]))
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_empty_constraints_change_nothing(kind: str, solver: str) -> None:

@@ -89,6 +89,7 @@ def driven_on(mpc: MPC, B: int = 1) -> np.ndarray:
     return x
 
 
+@pytest.mark.slow
 def test_a_loop_brakes_where_that_is_clear_and_its_plan_isnt() -> None:
     """No time for a solve: braking at one of five rates of turn is known by NumPy to be clear, so the loop is."""
     draw, mpc, braked = np.random.default_rng(0), MPC(drives(), "interior_point"), 0
@@ -126,7 +127,7 @@ def wall() -> FunctionConstraint:
     return FunctionConstraint(lambda x: x[..., :1] - 5.0)
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "parts", [[], [RateBounds(-0.3, 0.3, previous=[0.0, 0.0])], [Link(components=[2, 3])]], ids=["", "rates", "link"]
 )
@@ -146,6 +147,7 @@ def test_a_first_step_that_fails_keeps_the_bounds_and_says_so(parts: list[Any]) 
         assert u[0] < -0.5  # back to where it may be
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchgco.HorizonWarning")
 def test_a_first_step_that_fails_in_free_time_keeps_the_bounds() -> None:
     goal, cost = Goal(state=[0.0] * 4, required=True), QuadraticCost([0.0] * 4, [1e-3] * 2, [0.0] * 4)
@@ -195,6 +197,7 @@ MODELS: dict[str, tuple[Dynamics, list[float], float]] = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", MODELS)
 def test_vehicles_of_any_model_come_to_rest(name: str) -> None:
     """The speed at the end, as a share of that at the start."""

@@ -44,6 +44,7 @@ def test_vehicles_get_the_plans_of_others_and_the_rest_keep_theirs() -> None:
     assert torch.equal(both.X[1], mine.X[1]) and torch.equal(both.K, mine.K) and torch.equal(mine.X, plan().X)
 
 
+@pytest.mark.slow
 def test_a_missions_plan_is_sampled_like_any_other() -> None:
     """At a knot its state; between two what the model's own step leads to; with feedback within the bounds."""
     flight = Flight(mission(duration=0.2), far(2))

@@ -59,6 +59,7 @@ def layouts(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_command_writes_tables_and_a_page(layouts: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "my controls").mkdir()
     task = Scene.read(layouts).vehicle.task(Layouts.load(layouts))
@@ -96,6 +97,7 @@ def test_best_costs_of_another_file(layouts: Path, tmp_path: Path) -> None:
     assert main([str(layouts), str(tmp_path / "rest.npz"), "--best", str(tmp_path / "best.npz")]) == 2
 
 
+@pytest.mark.slow
 def test_a_report_compares_foreign_controls_with_a_study(run, tmp_path: Path, capsys) -> None:
     (tmp_path / "data").mkdir()
     path = tmp_path / "data" / "planar_trap.npz"
@@ -174,6 +176,7 @@ def test_a_leaderboard_of_good_entries_and_bad_ones(tmp_path: Path, capsys) -> N
     assert set(re.findall(r'href="(\w+)', (folder / "board.html").read_text())) == {"https"}
 
 
+@pytest.mark.slow
 def test_entries_are_ranked_against_each_other_where_no_best_cost_is_known(tmp_path: Path) -> None:
     folder = board(tmp_path)
     layouts = Layouts.load(folder / "layouts" / "planar_trap.npz")

@@ -46,6 +46,7 @@ def table_of(U: np.ndarray, **more: Any) -> pd.DataFrame:
     return pd.DataFrame({"layout": layout, "k": k, "u1": U[..., 0].ravel(), "u2": U[..., 1].ravel(), **more})
 
 
+@pytest.mark.slow
 def test_a_study_judged_by_its_controls_alone(run, path: Path, tmp_path: Path) -> None:
     words = ["scenario=layouts", f"scenario.path={path}", "model=planar", "solver=al_ilqr", "study.workers=1"]
     code, _, err = run(*words, "study.baselines=[interior_point]", "study.figures=false", "hydra.run.dir=flown")
@@ -61,6 +62,7 @@ def test_a_study_judged_by_its_controls_alone(run, path: Path, tmp_path: Path) -
     assert (trials["kkt_residual"].isna() == ~own["feasible"]).all()
 
 
+@pytest.mark.slow
 def test_an_npz_file_and_a_csv_file_of_the_same_controls_are_judged_alike(
     path: Path, U: np.ndarray, tmp_path: Path
 ) -> None:
@@ -102,6 +104,7 @@ def test_a_csv_file_of_several_solvers(path: Path, U: np.ndarray, tmp_path: Path
         judge_files(path, [tmp_path / "both.csv"])
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", ["<f4", ">f8", ">f4", "<f2", "i4"])
 def test_numbers_of_other_kinds_are_judged_as_they_are(kind: str, path: Path, U: np.ndarray, tmp_path: Path) -> None:
     given = np.nan_to_num(U).astype(kind)
@@ -111,6 +114,7 @@ def test_numbers_of_other_kinds_are_judged_as_they_are(kind: str, path: Path, U:
     pd.testing.assert_frame_equal(*(table.drop(columns="solver") for table in trials), rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_what_is_missing_fails_alone(path: Path, U: np.ndarray, tmp_path: Path) -> None:
     rows = table_of(U)
     rows[~((rows["layout"] == 1) & (rows["k"] == 7)) & (rows["layout"] != 2)].to_csv(tmp_path / "few.csv", index=False)
@@ -233,6 +237,7 @@ def test_wrong_files_are_one_line(case: str, path: Path, tmp_path: Path) -> None
     assert "\n" not in str(error.value) and not (tmp_path / "ran").exists()
 
 
+@pytest.mark.slow
 def test_many_names_take_no_memory_before_they_are_refused(path: Path, tmp_path: Path) -> None:
     """A line for each of 600,000 solvers would make arrays of 1.7 TB."""
     lines = "\n".join(f"0,0,1,1,{i}" for i in range(600_000))
@@ -271,6 +276,7 @@ def test_layouts_that_are_numbered_otherwise(path: Path, U: np.ndarray, tmp_path
     assert trials["layout_digest"].tolist() == whole["layout_digest"].iloc[[2, 0]].tolist()
 
 
+@pytest.mark.slow
 def test_the_model_is_that_with_as_many_states(path: Path, U: np.ndarray, tmp_path: Path) -> None:
     assert Scene.read(path).vehicle.name == "planar" and Scene.read(DATA / "walls.npz").vehicle.name == "quadrotor"
     wide = Scene.read(path, ["model.vehicle.control_weight=[5,5]"])

@@ -69,6 +69,7 @@ def absent(boxes: Cuboids) -> Cuboids:
     return replace(boxes, absent=torch.ones_like(boxes.absent), **none)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("spheres", mostly([0, 3], 0))
 @pytest.mark.parametrize("d", [2, 3])
 def test_paths_are_free_and_the_same_in_c_and_in_pytorch(d: int, spheres: int) -> None:
@@ -147,6 +148,7 @@ def wall_in_space(B: int = 2) -> Problem:
     )  # fmt: skip
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("wall", [wall_in_the_plane, wall_in_space])
 def test_the_goal_behind_a_wall_with_an_opening_is_reached(wall) -> None:
     problem = wall()

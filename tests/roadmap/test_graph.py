@@ -181,6 +181,7 @@ def test_a_nan_price_closes_its_edges() -> None:
         assert not bool(search.cheapest(chain(5), price)[2])
 
 
+@pytest.mark.slow
 def test_a_problem_has_the_same_bits_in_every_batch() -> None:
     parts = [drawn(3, 12, seed) for seed in range(27)]
     ends = (torch.cat([getattr(part, name) for part in parts]) for name in ("start", "goal"))

@@ -27,6 +27,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     return trunks(B=5, K=14)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", mostly([0, 2**26], 2**26))
 def test_further_paths_are_those_of_a_search_from_the_beginning(
     scene: Scene, room: int, monkeypatch: pytest.MonkeyPatch

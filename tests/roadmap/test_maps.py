@@ -197,6 +197,7 @@ def test_batches_take_each_problems_own_map_and_give_the_same_paths() -> None:
     assert bool(found.all()) and not torch.equal(paths[0], paths[1])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("merged", mostly([True, False], False))
 def test_numpy_finds_the_same_blocks_ways_and_taut_paths(d: int, merged: bool) -> None:
@@ -233,6 +234,7 @@ def solver_of(problem: Problem) -> Solver:
     return presets.gco(problem)
 
 
+@pytest.mark.slow
 def test_gco_flies_around_walls_with_the_same_bits_alone_and_in_a_batch() -> None:
     cells = np.zeros((30, 24), bool)
     cells[14:16, :14] = True  # the straight way ends in front of it

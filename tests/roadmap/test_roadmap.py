@@ -137,6 +137,7 @@ def test_a_path_goes_where_a_metre_is_cheap() -> None:
         assert float(across.min()) < 0 if side > 0 else float(across.max()) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("native", mostly([True, False], False))
 def test_no_path_on_the_graph_is_cheaper(native: bool) -> None:
     """The search finds a path of the same cost as Dijkstra on the same graph."""

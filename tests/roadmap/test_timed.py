@@ -79,6 +79,7 @@ def reference(scene: TimedScene) -> np.ndarray:
     return ways.through((0,) * a.d, ways.moves[scene.first]).reshape(a.layers + 1, -1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("counts", "layers", "seed", "ends"),
     [((6, 5), 6, 0, 1), ((6, 5), 6, 1, 3), ((7, 4), 5, 2, 6), ((4, 3, 3), 4, 3, 1), ((3, 4, 3), 4, 4, 3)],

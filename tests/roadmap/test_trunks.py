@@ -50,6 +50,7 @@ def bound(parts: tuple[np.ndarray, ...]) -> Cuboids:
     return found.inflated()
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_paths_through_a_forest_are_free_and_the_same_in_c_and_in_pytorch(tilt: float) -> None:
     scene, (starts, ends, radii) = trunks(B=4, K=40, tilt=tilt)

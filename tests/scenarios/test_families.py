@@ -218,6 +218,7 @@ def test_a_yard_may_lack_discs_or_boxes():
     assert bare.centers.shape == (2, 0, 2) and bare.box_centers is not None
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("scenario", FAMILIES, ids=names)
 def test_a_family_knows_the_number_of_its_states(scenario):
     start = compose([f"scenario={scenario.name}"]).vehicle.at_rest(scenario.draw([0], seed=0)).start

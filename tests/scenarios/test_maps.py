@@ -155,6 +155,7 @@ def test_maps_are_of_the_layouts_space_and_shared(tmp_path: Path) -> None:
         Layouts.load(tmp_path / "cut.npz")
 
 
+@pytest.mark.slow
 def test_a_study_flies_on_the_map(tmp_path: Path) -> None:
     """The command's words make problems with the map as a constraint, which the judge measures."""
     words = ["model=unicycle", "scenario=map", f"scenario.path={rooms(tmp_path)}", "scenario.start=[0,3]"]

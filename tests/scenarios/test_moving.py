@@ -38,7 +38,7 @@ def clearance(layout: Layouts, p: np.ndarray, t: float) -> float:
     return least
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("scenario", ALL)
 def test_a_layout_depends_on_seed_and_number_alone(scenario) -> None:
     many = scenario.draw([0, 5], seed=3)
@@ -47,7 +47,7 @@ def test_a_layout_depends_on_seed_and_number_alone(scenario) -> None:
     assert many.name == scenario.name
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("scenario", QUICK)
 def test_a_point_gets_through_with_room_from_rest_to_rest(scenario: AmongMovers) -> None:
     for number in range(3):
@@ -131,6 +131,7 @@ def test_arms_turn_about_the_middle_of_their_opening() -> None:
     assert np.diff(spaced).max() <= 2 * 0.07 + 1e-9, "neighbours touch"
 
 
+@pytest.mark.slow
 def test_belts_miss_some_discs_and_walkers_stay_away_at_first() -> None:
     drawn = Conveyor(missing=0.4).draw(range(4), seed=0)
     y = np.sort(drawn.centers[0][drawn.centers[0, :, 0] == 1.4, 1])
@@ -152,6 +153,7 @@ def test_what_cannot_be_drawn_is_said(monkeypatch) -> None:
         Walkers(clearance=50.0).draw([0], seed=0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("scenario", QUICK)
 def test_files_keep_them_and_any_model_of_the_plane_moves_there(scenario: AmongMovers, tmp_path: Path) -> None:
     drawn = scenario.draw([0], seed=4)
@@ -163,6 +165,7 @@ def test_files_keep_them_and_any_model_of_the_plane_moves_there(scenario: AmongM
         assert problem.x0[0, :2].tolist() == list(scenario.start)
 
 
+@pytest.mark.slow
 def test_a_walk_through_the_room_is_found() -> None:
     setup = compose(["scenario=walkers", "seed=1"])
     problem = setup.task(setup.layouts(2)).problem

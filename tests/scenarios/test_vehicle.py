@@ -57,6 +57,7 @@ def test_a_mismatch_names_the_model_to_give(name: str, other: str) -> None:
         vehicle(name).task(layouts)
 
 
+@pytest.mark.slow
 def test_the_built_in_models_are_those_of_the_configurations() -> None:
     assert set(BUILT_IN) == {path.stem for path in (ROOT / "conf" / "model").glob("*.yaml")}
     for name, form in BUILT_IN.items():
@@ -88,6 +89,7 @@ def test_of_two_models_in_the_plane_the_one_that_fits_is_named(words: str, line:
     assert caught.value.field == "model" and line in str(caught.value)
 
 
+@pytest.mark.slow
 def test_layouts_without_states_fit_both_models_in_the_plane(tmp_path) -> None:
     Layouts(centers=[[[0.0, 0.0]]], radii=[[0.1]]).save(tmp_path / "bare.npz")
     words = ["scenario=layouts", f"scenario.path={tmp_path / 'bare.npz'}"]

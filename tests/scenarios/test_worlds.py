@@ -78,6 +78,7 @@ def test_a_wall_is_closed_but_for_its_opening() -> None:
     assert np.unique(x).tolist() == [5.75, 9.5, 13.25]
 
 
+@pytest.mark.slow
 def test_doors_join_all_rooms_by_one_way() -> None:
     """Without loops: as many doors as rooms but one, so nothing is left to go around by."""
     low, high, spacing = np.array([-2.0, -2.0, -1.5]), np.array([10.0, 6.0, 4.5]), 0.15
@@ -142,6 +143,7 @@ def test_refuses(make, message) -> None:
     assert message in str(caught.value)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", WORLDS)
 def test_the_public_layouts_are_drawn_by_the_rules(name) -> None:
     """The first public layout is among the first ones drawn: those without a way through were left out."""

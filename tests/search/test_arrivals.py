@@ -82,6 +82,7 @@ def test_times_stay_within_their_bounds() -> None:
     assert bool(((solution.duration >= 6.5 - 1e-6) & (solution.duration <= 7.0 + 1e-6)).all())
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("broken", [(0, np.nan), (1, np.inf), (3, np.nan), (2, -np.inf)])
 def test_a_start_that_is_no_place_is_its_own_problems_alone(broken: tuple[int, float]) -> None:
     """It ended the solve of the whole batch with an error of NumPy."""

@@ -67,6 +67,7 @@ def without_clearing(problem: Problem) -> Tensor:
         return solve(problem, solver=without(presets.gco(problem), ClearChords)).U
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [coarse_disc, pytest.param(corners, marks=pytest.mark.slow)])
 def test_chords_are_cleared_and_nothing_else_changes(make) -> None:
     problem, solution = cleared(make)

@@ -35,6 +35,7 @@ def bicycle(drift: float, end: float = 1.0) -> Problem:
     )
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("drift", "cost"), [(0.01, 780.93), (0.05, 780.14)])
 def test_an_optimum_that_a_solve_was_stopped_at_is_found(drift: float, cost: float) -> None:
     """Searches of thousands of iterations ended at 798.9 and 797.7."""

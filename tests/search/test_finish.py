@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -96,6 +97,7 @@ def test_a_problem_without_a_solution_is_infeasible_and_soon() -> None:
     assert Status.INFEASIBLE not in cut.statuses  # its limit, not the problem, ended the solve
 
 
+@pytest.mark.slow
 def test_a_problem_keeps_its_bits_in_any_batch() -> None:
     whole, part = torchgco.solve(parking(3)), parking(3).take(torch.tensor([1]))
     assert torch.equal(torchgco.solve(part, ids=torch.tensor([1])).U[0], whole.U[1])
@@ -115,6 +117,7 @@ def rocket() -> Problem:
                    [ControlBounds(0.0, 3.5)], x0, 60)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_guess_that_overflows_starts_in_the_middle_of_the_bounds() -> None:
     problem = rocket()
     X = torchgco.dynamics.rollout.open_loop(problem.dynamics, problem.x0, torch.zeros(2, 60, 1, dtype=D))

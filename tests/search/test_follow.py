@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from tests.reference import boxes as brute_force
@@ -267,6 +268,7 @@ def test_how_deep_points_lie_against_brute_force() -> None:
             assert [bool(deep[b, i]) for deep in found] == [-nearest > at for at in limits]
 
 
+@pytest.mark.slow
 def test_a_path_through_doors_is_followed_closer_where_no_candidate_arrives() -> None:
     setup = compose(["scenario=mazes", "scenario.walls=2", "solver=gco", "study.layouts=4"])
     problem = setup.task(setup.layouts()).problem

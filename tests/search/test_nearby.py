@@ -74,7 +74,7 @@ def test_what_is_known_of_starts_holds_among_fewer_obstacles(inside: bool) -> No
     assert near is not None and bool(near.call.problem.start_is_clear.all())
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.sampled(0)
 @pytest.mark.parametrize("kind", mostly(["spheres", "boxes", "body"], "body"))
 def test_far_obstacles_change_no_bit(kind: str) -> None:
     few, many, U0 = planar(kind, 9.0)
@@ -101,6 +101,7 @@ def test_a_single_far_obstacle_changes_no_bit() -> None:
         assert torch.equal(a, b)
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_problems_that_keep_all() -> None:
     """In a batch with a problem whose obstacles are near, the others leave theirs out all the same."""
     _, many, U0 = planar("spheres", 9.0)

@@ -190,6 +190,7 @@ def differ(one: Solution, other: Solution) -> bool:
     return not (torch.equal(one.U, other.U) and torch.equal(one.iterations, other.iterations))
 
 
+@pytest.mark.slow
 def test_rows_solve_by_the_interior_point_of_their_table() -> None:
     problem = brachistochrone()
     solver = Restarts(replace(presets.gco(problem).local, guidance=None), (Converge("free"), Solve(), Starts(2, "all")))
@@ -198,6 +199,7 @@ def test_rows_solve_by_the_interior_point_of_their_table() -> None:
     assert differ(solver.solve(problem, U0), other.solve(problem, U0))
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("case", mostly(CASES, CASES[-1]), ids=str)
 def test_every_field_is_read(case: Case) -> None:
     assert getattr(case.row, case.field) != case.value

@@ -66,6 +66,7 @@ class Stepped(Dynamics):
         return torch.cat((x[..., :2] + 0.1 * x[..., 2:] + 0.005 * u, x[..., 2:] + 0.1 * u), dim=-1)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("more", [[], [RateBounds(-1.0, 1.0)]])
 def test_a_model_with_a_step_alone_and_bounded_rates_are_looked_at(more: list) -> None:
     """A step may begin at 1 m/s along x and along y, and end at 1.1 m/s: it is 1.05 times as long."""

@@ -24,6 +24,7 @@ def recorded(solver: Restarts) -> Solution:
     return solver.solve(*gates(), seed=3)
 
 
+@pytest.mark.slow
 def test_recording_changes_no_result(solver: Restarts, recorded: Solution) -> None:
     plain = replace(solver, local=replace(solver.local, record=False)).solve(*gates(), seed=3)
     assert plain.search is None and torch.equal(plain.U, recorded.U)

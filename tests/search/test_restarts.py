@@ -132,6 +132,7 @@ def test_without_a_path_and_without_samples_the_stopped_solve_continues(solves: 
     assert torch.equal(solution.iterations, counts) and int(solves[-1].end.iterations) > 0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("weight", "attracted"), [(1.0, False), (6.0, True), (100.0, False)])
 def test_a_trajectory_that_ends_close_to_the_goal_is_finally_attracted_to_it(
     weight: float, attracted: bool, solves: list[Solve], monkeypatch

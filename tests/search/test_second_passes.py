@@ -76,6 +76,7 @@ def test_costly_proposals_are_compared_with_those_along_more_paths(woods) -> Non
     assert bool((gaps(woods, twice.U) < gap + 0.05).all())
 
 
+@pytest.mark.slow
 def test_a_candidate_that_is_too_deep_counts_where_refining_mends_it(woods) -> None:
     shallow = replace(FIRST, max_penetration=1e-9)
     some, times = noted([shallow, CLOSER], woods)
@@ -164,6 +165,7 @@ def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> 
     assert bool((found.iterations[~arrived] > alone.iterations[~arrived]).all())
 
 
+@pytest.mark.slow
 def test_a_converged_solve_is_enough_where_the_goal_is_assumed() -> None:
     """With x_ref beyond the horizon no solve arrives; a goal that is given is still sought by further attempts."""
     setup = compose(["scenario=crossing", "scenario.stages=30"])

@@ -85,12 +85,14 @@ def test_a_sound_guess_comes_back_sound_and_costs_no_more() -> None:
     assert {status.name for status in found.statuses} <= {"CONVERGED", "FEASIBLE"}
 
 
+@pytest.mark.slow
 def test_the_interior_point_goes_on_from_a_guess_that_is_better() -> None:
     problem, U = guessed()
     before, after = judge(problem, U).cost, judge(problem, solve(problem, U0=U, verbose=False).U).cost
     assert bool((after < 0.999 * before).any()), "cheaper, among boxes that are smaller than those of the guess"
 
 
+@pytest.mark.slow
 def test_a_problem_keeps_its_guess_alike_in_every_batch() -> None:
     problem, U = guessed()
     whole, order = solve(problem, U0=U, verbose=False), torch.tensor([2, 0])

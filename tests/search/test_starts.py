@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -55,6 +56,7 @@ def same(one: Solution, other: Solution) -> bool:
 SWINGS = swing_up(0.0, 0.3, -0.2, 1.0, -1.2)
 
 
+@pytest.mark.slow
 def test_they_are_never_worse_and_find_cheaper_swings() -> None:
     once, again = solved(SWINGS), solved(SWINGS, ALL)
     assert bool((once.status == Status.CONVERGED).all() and (again.status == Status.CONVERGED).all())
@@ -69,6 +71,7 @@ def test_nothing_is_solved_where_nothing_is_left(monkeypatch) -> None:
     assert solved(SWINGS, Starts()).status.tolist() == [Status.CONVERGED] * 5 and not begun
 
 
+@pytest.mark.slow
 def test_more_starts_are_the_same_and_more() -> None:
     """Of n starts, the first are those of a pass with fewer."""
     problem = swing_up(0.0, -0.2, -1.2, N=60)
@@ -78,6 +81,7 @@ def test_more_starts_are_the_same_and_more() -> None:
     assert bool((costs[-1] < 0.99 * costs[0]).any())
 
 
+@pytest.mark.slow
 def test_no_result_depends_on_the_batch_or_on_slots() -> None:
     ids = torch.tensor([7, 3, 11, 2, 5])
     whole = solved(SWINGS, ALL, seed=4, ids=ids)

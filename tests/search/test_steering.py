@@ -146,6 +146,7 @@ def test_speeds_slow_down_in_time_for_bends() -> None:
     assert bool((speed_limit(steered(problem(model(car))), points, 0.05, AHEAD) == np.inf).all())  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_car_finds_through_the_rooms_of_a_map() -> None:
     own = room(model=model(car), N=150)
     verdict = judge(own, solve(own).U)

@@ -79,6 +79,7 @@ def test_each_leg_passes_on_its_better_side() -> None:
     assert bool(verdict.reached) and int(verdict.gates_passed) == len(PLACES)
 
 
+@pytest.mark.slow
 def test_chords_are_clear_where_stages_are_long() -> None:
     """With eight stages a leg the optimum at the knots alone cuts the discs."""
     problem = course(DISCS, stages=8)
@@ -88,6 +89,7 @@ def test_chords_are_clear_where_stages_are_long() -> None:
     assert bool(judge(problem, found.U, times=found.t).reached) and float(found.violation) <= 1e-6
 
 
+@pytest.mark.slow
 def test_a_course_has_the_same_bits_in_any_batch() -> None:
     problem = course(DISCS, B=3)
     found = torchgco.solve(problem, record=True)

@@ -76,6 +76,7 @@ def traffic(seed: int, B: int = 3, lanes: int = 4) -> Problem:
     return Problem(point(), cost([end, 0, 0, 0]), rows, torch.zeros(B, 4, dtype=D), 50, Goal([end, 0.0], 0.3))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchgco.base.errors.ContactWarning")  # of the solver without the row
 def test_lanes_of_traffic_are_crossed_and_the_same_alone() -> None:
     problem = traffic(2)
@@ -91,6 +92,7 @@ def test_lanes_of_traffic_are_crossed_and_the_same_alone() -> None:
     assert torch.equal(alone.U, solution.U[one]) and torch.equal(alone.iterations, solution.iterations[one])
 
 
+@pytest.mark.slow
 def test_where_there_is_no_way_the_status_says_so() -> None:
     """A row of discs without gaps that drives across: nothing passes it before the end."""
     y = np.arange(-12, 12, 0.5)
@@ -106,6 +108,7 @@ def test_where_there_is_no_way_the_status_says_so() -> None:
     assert solution.statuses[0].name in ("CONVERGED", "FEASIBLE")
 
 
+@pytest.mark.slow
 def test_a_leaf_that_slides_is_passed_while_it_is_open_clear_between_knots_too() -> None:
     c, half = [[2.0, -1.65], [2.0, 1.65], [2.0, 0.6]], [[0.1, 1.35], [0.1, 1.35], [0.12, 0.3]]
     zero = np.zeros((3, 1, 2))
@@ -196,6 +199,7 @@ def test_lattices_have_few_moves_and_states_at_any_scale(scale: float, fast: flo
         assert np.all(lattice.points.min(0) <= 0.0) and lattice.points[:, 0].max() >= way - lattice.spacing
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_a_default_of_double_precision_changes_nothing(seed: int) -> None:
     """C reads clearances and costs of ways in single precision: in double, the first search ended the solve."""

@@ -95,6 +95,7 @@ def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch, model: D
     assert len(good) > 1 and float(found.cost[0]) == pytest.approx(min(good) * float(problem.cost_unit[0]), rel=1e-9)
 
 
+@pytest.mark.sampled(1)
 @MODELS
 def test_the_result_does_not_depend_on_the_batch(model: Dynamics) -> None:
     problem = room(model=model)

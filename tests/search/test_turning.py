@@ -140,6 +140,7 @@ def test_a_goal_that_binds_is_released_where_the_terminal_cost_draws_into_it() -
     assert bool(judge(required, held.U).reached.all()) and float(held.cost) <= 1.001 * float(free.cost) < 12.2
 
 
+@pytest.mark.slow
 def test_nothing_is_released_that_binds_or_was_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     released: list[int] = []
     usual = Problem.releasing_goal
@@ -157,6 +158,7 @@ def test_nothing_is_released_that_binds_or_was_caught(monkeypatch: pytest.Monkey
     assert sum(released) == 5
 
 
+@pytest.mark.slow
 def test_the_rest_of_a_batch_changes_nothing() -> None:
     problem = turning("car", headings(4, 3), walls=True)
     bad = torch.where(torch.arange(4).unsqueeze(-1) == 2, torch.nan, problem.x0)

@@ -32,6 +32,7 @@ def small(x0: Tensor, high: Tensor | float = 3.0) -> Solution:
     return torchgco.solve(Problem(MODEL, COST, [ControlBounds(-3.0, high)], x0, 10), verbose=False)
 
 
+@pytest.mark.slow
 @compiled
 def test_gradients_of_a_problem_do_not_depend_on_its_batch() -> None:
     th = numbers()
@@ -50,6 +51,7 @@ def test_gradients_of_a_problem_do_not_depend_on_its_batch() -> None:
             assert torch.equal(one, all_of_them[rows]), name
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("in_c", [pytest.param(True, marks=compiled), False])
 def test_gradients_keep_their_bits_in_both_kernels(in_c: bool) -> None:
     """Of a model without a product of all knots with one matrix, whose last bits PyTorch's kernels can't keep."""
@@ -87,6 +89,7 @@ def test_solves_that_nothing_asks_gradients_of_keep_their_bits() -> None:
     assert torch.equal(live.status, plain.status) and torch.allclose(live.X, plain.X, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradcheck() -> None:
     x0, high = torch.tensor([[1.0, 0.0], [-1.5, 1.0]], dtype=D), torch.tensor([[0.9], [1.2]], dtype=D)
 
@@ -127,6 +130,7 @@ def test_each_solve_has_a_graph_of_its_own() -> None:
         first.cost.sum().backward()
 
 
+@pytest.mark.slow
 def test_solutions_with_gradients_serve_as_others_do(tmp_path) -> None:
     leaves, solution = solved(boxed, box_numbers)
     problem = boxed(leaves)

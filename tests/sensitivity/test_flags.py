@@ -57,6 +57,7 @@ def test_weak_rows_that_don_t_matter_are_no_reason() -> None:
     assert solution.reason is not None and solution.reason.tolist() == [Why.WEAKLY_ACTIVE]  # U depends on the bound
 
 
+@pytest.mark.slow
 def test_dependent_rows() -> None:
     ends = FunctionConstraint(lambda x: x[..., :1] - 0.2, "equality", knots=[N])
     assert reasons(Problem(MODEL, COST, [ends], start((1.0, 0.0)), N)) == [Why.DIFFERENTIABLE]
@@ -128,7 +129,7 @@ def test_gradients_of_a_batch_without_derivatives_are_zero() -> None:
     assert x0.grad is not None and not x0.grad.any()
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.parametrize("form", [*FORMS, "discs", "boxed"])
 def test_no_gradient_is_missing_where_there_is_none(form: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,6 +102,7 @@ def value(found: Solution) -> Tensor:
     return total if found.times is None else total + 3 * found.duration.sum() + found.t[:, 7].sum()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("form", "smoothing"), [*((form, 0.0) for form in list(FORMS)[:4]), ("horizons", 1e-3), *SLOW])
 def test_gradients_are_differences(form: str, smoothing: float) -> None:
     make, given = FORMS[form]

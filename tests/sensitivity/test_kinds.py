@@ -53,17 +53,19 @@ def check(
     assert float(mine[0].abs()) > 1e-3 or name == "lower"
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", mostly(KINDS, *KINDS[::3], *KINDS[1::3]))
 def test_among_discs(name: str) -> None:
     check(discs, numbers, name)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", mostly(box_numbers(), *tuple(box_numbers())[::2]))
 def test_around_a_box(name: str) -> None:
     check(boxed, large_numbers, name)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", mostly(box_numbers(), *tuple(box_numbers())[::2]))
 def test_cleared_between_knots(name: str) -> None:
     """Minima of the problem with a box that has grown for this, by a constant."""
@@ -73,6 +75,7 @@ def test_cleared_between_knots(name: str) -> None:
     check(boxed, box_numbers, name, grown)
 
 
+@pytest.mark.slow
 def test_kernels_in_pytorch_give_the_same() -> None:
     leaves, solution = solved(discs, numbers)
     mine = torch.autograd.grad(along(solution, weights(solution)).sum(), list(leaves.values()), retain_graph=True)

@@ -87,6 +87,7 @@ def solved(problem: Problem, native: bool, give: Tensor | None = None) -> KktSol
         use_native(True)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", mostly([True, False], False))
 @pytest.mark.parametrize(
     ("traced_cost", "barrier"), [(True, False), pytest.param(False, False, marks=pytest.mark.slow), (False, True)]
@@ -120,6 +121,7 @@ def test_solutions_are_those_of_a_dense_matrix(native: bool, traced_cost: bool, 
             assert not found.z[c, b, 0, :3].any() and not found.v[c, b][~active[b]].any()
 
 
+@pytest.mark.slow
 def test_problems_do_not_depend_on_their_batch() -> None:
     problem = curved(False)
     whole, (X, U, lam, active, right) = solved(problem, True), systems(problem)
@@ -132,6 +134,7 @@ def test_problems_do_not_depend_on_their_batch() -> None:
     assert torch.equal(found.costates, whole.costates[rows])
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", [True, False])
 def test_rows_that_depend_on_each_other_and_saddles_are_told(native: bool) -> None:
     ends = FunctionConstraint(lambda x: x[..., :1], "equality", knots=[N])

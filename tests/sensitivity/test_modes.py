@@ -89,6 +89,7 @@ def test_forward_mode_needs_kernels_in_c() -> None:
         use_native(True)
 
 
+@pytest.mark.slow
 @compiled
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 def test_a_solve_in_free_time_is_the_same_within_forward_mode() -> None:

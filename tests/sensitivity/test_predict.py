@@ -28,6 +28,7 @@ def error(found: Solution, due: Solution) -> Tensor:
     return (found.U - due.U).abs().flatten(1).amax(-1)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", mostly(MOVED, *list(MOVED)[1::2]))
 def test_its_error_is_of_second_order(name: str) -> None:
     before, known = solved(discs, numbers)

@@ -76,7 +76,7 @@ def test_it_is_the_minimum_of_the_cost_with_logarithms(kernels: str) -> None:
     assert found.statuses == [Status.FEASIBLE] and not found.X.requires_grad and bool(found.differentiable.all())
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "name",
     mostly(

@@ -28,6 +28,7 @@ def steered() -> FunctionDynamics:
     return FunctionDynamics(lambda x, u: u, 2, 2, 0.1, position=slice(0, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")  # of the interior point alone
 @pytest.mark.parametrize(
     ("solver", "warm"), mostly([("gco", False), ("interior_point", True)], ("gco", False), several=True)
@@ -104,6 +105,7 @@ def test_parts_of_a_batch_keep_their_gradients() -> None:
     assert not slope[1].any() and bool((slope[[0, 2]] != 0).any(-1).all())
 
 
+@pytest.mark.slow
 def test_rows_that_hold_are_held_exactly() -> None:
     """planar_trap: with a softer hold of active rows, derivatives of half of these problems are off by over 1e-4."""
     planner = compose(["model=planar", "scenario=planar_trap"])

@@ -54,7 +54,7 @@ def _reference(problem, U0, b: int, tolerance: float, limit: int, guided: bool):
     return reference_solve(twin, U0[b].numpy(), schedule, guidance=cpuf_hook(twin, noise, settings, vehicle))
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("guided", [False, True], ids=["al_ilqr", "gco"])
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("native", mostly(["native", "eager"], "eager"), indirect=True)

@@ -18,6 +18,7 @@ from torchgco.solvers import augmented_lagrangian
 from torchgco.solvers.contracts import Advice
 
 
+@pytest.mark.slow
 def test_optimum_agrees_with_slsqp() -> None:
     """Cost and path of a planar problem with one disc, solved by SciPy over the controls."""
     problem, U0 = planar_batch(B=1, N=15, obstacles=1, seed=6)

@@ -63,6 +63,7 @@ BATCHES = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("solver", ["gco", "restarts"])
 @pytest.mark.parametrize("batch", ["planar", "quadrotor", pytest.param("boxes", marks=pytest.mark.slow)])
 def test_freed_slots_are_taken_by_waiting_problems(batch: str, solver: str) -> None:
@@ -87,13 +88,14 @@ def solve_rows(solver, problem: Problem, U0, rows: list[int]) -> Solution:
     return solver.solve(problem.take(index), U0[index], seed=3, ids=index)
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_alone_in_any_batch_and_in_any_order(batch: str, solver: str) -> None:
     check_alone_in_any_batch_and_in_any_order(batch, solver)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("native", ["eager"], indirect=True)
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "restarts"])
 @pytest.mark.parametrize(

@@ -95,6 +95,7 @@ def test_linear_problems_have_the_states_of_a_dense_system(solver: str) -> None:
         assert np.array_equal(solution.X[b, 0].numpy()[~free], problem.x0[b].numpy()[~free])
 
 
+@pytest.mark.slow
 def test_free_and_given_starts_in_one_batch_have_the_bits_of_each_alone() -> None:
     problem, *_ = linear()
     together = InteriorPoint().solve(problem, zeros(problem))

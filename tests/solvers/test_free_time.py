@@ -71,6 +71,7 @@ def least_time(x0: torch.Tensor, fastest: float = INF) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("fastest", [INF, 1.0])
 @pytest.mark.parametrize("guess", [None, 0.1, 1.0, 10.0])
 def test_least_times_are_those_of_the_closed_form(fastest: float, guess: float | None) -> None:
@@ -86,6 +87,7 @@ def test_least_times_are_those_of_the_closed_form(fastest: float, guess: float |
     torch.testing.assert_close(found.cost, found.duration)
 
 
+@pytest.mark.slow
 def test_segments_switch_exactly() -> None:
     problem = carts(N=20, segments=2)
     found = torchgco.solve(problem)
@@ -114,6 +116,7 @@ def test_what_is_left_of_controls_that_cost_nothing_is_measured_by_the_cost(seed
         assert float(certify(problem, found.X, found.U, None, lams, found.t).kkt_residual.max()) < 5e-3
 
 
+@pytest.mark.slow
 def test_judge_certificate_tables_and_files_know_the_times(tmp_path: Path) -> None:
     problem = carts()
     found = torchgco.solve(problem)
@@ -152,6 +155,7 @@ def test_a_held_time_that_is_optimal_has_no_slope_in_time() -> None:
     assert float(best.cost) < float(judge(one, at_nominal.U, times=even).cost)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("segments", [None, 2])
 def test_a_problem_has_the_same_bits_in_any_batch(segments: int | None) -> None:
     problem = carts(N=30, segments=segments)
@@ -175,6 +179,7 @@ def test_limits_on_rates_are_per_second() -> None:
     assert bool(judge(gentle, found.U, times=found.t).feasible.all())
 
 
+@pytest.mark.slow
 def test_the_least_time_that_would_do_is_told() -> None:
     problem = carts(most=0.8)
     with pytest.warns(HorizonWarning, match=r"time\.most: \d of 8 problems need more time"):
@@ -223,6 +228,7 @@ def plant() -> Problem:
     return flight(QuadrotorPlant(0.1), [ControlBounds(low, high), turns], Airframe().hover_thrust)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly(["euler", "midpoint", "rk4", "plant"], "midpoint", "rk4", "plant"))
 def test_quaternions_keep_their_norm_at_the_least_time(name: str) -> None:
     """Twenty seconds at the least time: the thrust isn't what the norm of a quaternion makes of it."""
@@ -236,6 +242,7 @@ def test_quaternions_keep_their_norm_at_the_least_time(name: str) -> None:
     assert float(push.max()) <= Airframe().accelerations[1] * (1.0 + 1e-6)
 
 
+@pytest.mark.slow
 def test_solvers_that_hold_the_time_are_refused() -> None:
     for solver in ("al_ilqr", "gco_paper", "mppi", "hold", "multistart"):
         with pytest.raises(InputError, match="solver: expected interior_point, gco, gco_exact, ipopt or fatrop"):
@@ -253,6 +260,7 @@ def test_peers_find_the_same_times(solver: str) -> None:
     torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=0)
 
 
+@pytest.mark.slow
 def test_the_time_frees_itself_of_its_guess_among_obstacles() -> None:
     """A ball around two discs: the same time from short and long guesses, clear, and at the goal."""
     x0 = torch.zeros(3, 4, dtype=D)
@@ -445,6 +453,7 @@ def test_the_states_and_controls_of_a_solution_are_kept_without_its_time() -> No
     assert bool((again.duration <= first.duration * (1.0 + 1e-4)).all())
 
 
+@pytest.mark.slow
 def test_drawn_guesses_find_shorter_times() -> None:
     """Of the default roughly, side by side, where a problem isn't convex; in any batch the same."""
     problem = braking(6, 5)
@@ -470,6 +479,7 @@ def test_what_looks_convex_at_a_held_time_is_solved_once() -> None:
     assert not bool(looks_convex(braking(3, 1), torch.zeros(3, 41, 4, dtype=D), torch.zeros(3, 40, 1, dtype=D)).any())
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.filterwarnings("ignore::torchgco.HorizonWarning")
 @pytest.mark.parametrize("most", [0.05, 0.4, 0.8])
 @pytest.mark.parametrize("name", ["gco", "gco_max", "gco_fast", "interior_point"])

@@ -54,6 +54,7 @@ CONTRADICTIONS = {
 }
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CONTRADICTIONS)
 def test_contradictions_are_infeasible(name: str) -> None:
     given = problem(*CONTRADICTIONS[name])
@@ -115,6 +116,7 @@ def least_excess(problem: Problem, b: int) -> float:
     return float(found.x[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly(range(6), *range(1, 6)))
 def test_gates_that_contradict_each_other_are_infeasible(seed: int) -> None:
     problem = courses(seed)

@@ -312,6 +312,7 @@ def everything(B: int = 4, N: int = 20) -> Problem:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_all_that_a_problem_may_have_at_the_cost_of_ipopt() -> None:
     """Among obstacles each finds a minimum of its own from a guess, but IPOPT stays at the one found here."""
     problem = everything()
@@ -324,6 +325,7 @@ def test_all_that_a_problem_may_have_at_the_cost_of_ipopt() -> None:
     assert all(binding[:5])  # every kind of rows binds somewhere
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("make", [everything, flights])
 def test_eight_digits_on_request(make) -> None:
     """By the certificate, which tests the returned multipliers; it refuses others, and another trajectory."""

@@ -73,6 +73,7 @@ def made(monkeypatch) -> list[int]:
     return made
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("batch", BATCHES)
 def test_every_iteration_is_counted_once(batch: str, name: str, made: list[int]) -> None:
@@ -88,6 +89,7 @@ def test_every_iteration_is_counted_once(batch: str, name: str, made: list[int])
         assert int(alone.iterations) == int(together.iterations[b]) == sum(made)
 
 
+@pytest.mark.slow
 def test_candidates_take_most_iterations_and_are_not_in_the_trace() -> None:
     problem, U0 = BATCHES["planar"]()
     solution = guided(problem, record=True).solve(problem, U0, seed=3)

@@ -50,6 +50,7 @@ def best_of(numbers: torch.Tensor, N: int, grid: bool) -> float:
     return linprog(np.r_[0 * price, price, -price], A_eq=steps, b_eq=np.zeros(N), bounds=bounds, **limits).fun
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("grid", mostly([False, True], False))
 @pytest.mark.parametrize(("N", "most", "weight"), [(24, 40, 0.0), (480, 70, TINY)])
 def test_drawn_programmes(N: int, most: int, weight: float, grid: bool) -> None:
@@ -113,6 +114,7 @@ def drawn_programme(seed: int, n: int = 2, m: int = 2, p: int = 2, N: int = 12) 
     return Problem(model, value, [row, ControlBounds(*torch.tensor(ends))], torch.tensor(x0)[None], N), status
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", mostly([range(20), range(20, 80)], range(20)), ids=str)
 def test_programmes_without_an_end(seeds: range) -> None:
     """What HiGHS calls unbounded is never said to be feasible, and most is told; what has an optimum isn't."""

@@ -88,6 +88,7 @@ def test_the_estimate_is_that_of_one_problem() -> None:
     assert element_bytes(problem) == least_bytes(10, 6, 2, rows)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize(
     "row", [Link(components=[2]), Integral(lambda x, u: u.square().sum(-1), most=9.0), RateBounds(-1.0, 1.0)]

@@ -135,6 +135,7 @@ def test_the_status_is_one_of_four_by_stationarity_and_violation() -> None:
     assert bool((optimality(lagrangian, done.X, done.U).left <= STATIONARY).all())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchgco.ContactWarning")
 @pytest.mark.filterwarnings("ignore::torchgco.StepWarning")  # Euler steps of half a second are what is unstable
 def test_unstable_dynamics_are_solved_from_rest() -> None:

@@ -57,6 +57,7 @@ def base_run() -> tuple:
     return _run(BASE)
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize(
     ("cls", "change"), [(cls, {name: value}) for cls, changes in CHANGES.items() for name, value in changes.items()]
 )

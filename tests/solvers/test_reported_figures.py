@@ -112,6 +112,7 @@ COSTS = {
 }
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("solver", ["gco", "gco_fast", "interior_point", "al_ilqr"])
 @pytest.mark.parametrize("name", COSTS)
 def test_a_cost_that_is_not_finite_is_no_solution(name: str, solver: str) -> None:

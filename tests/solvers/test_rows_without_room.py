@@ -91,6 +91,7 @@ def test_the_plain_problems_have_the_costs_of_ipopt(count: int) -> None:
         torch.testing.assert_close(ours, theirs, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9])
 @pytest.mark.parametrize("make", [battery, cart, rocket])
@@ -103,6 +104,7 @@ def test_bounds_that_a_given_start_meets(make: Callable[[float], Plain], off: fl
     assert_same_answer(torchgco.solve(of([own[0], also]), solver=solver), torchgco.solve(of(own), solver=solver))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", MOSTLY)
 def test_rows_that_are_constant(solver: str) -> None:
     """By a mask, at all knots, at the start of a state that nothing changes, and of states and controls together."""
@@ -137,6 +139,7 @@ def test_rows_of_a_state_that_nothing_moves(solver: str) -> None:
         assert_same_answer(torchgco.solve(of([*own, more]), solver=solver), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", MOSTLY)
 def test_rows_that_move_by_rounding_alone(solver: str) -> None:
     """The length of what is turned."""
@@ -231,6 +234,7 @@ def test_rows_that_leave_one_point(solver: str) -> None:
     torch.testing.assert_close(found.cost[:4], theirs.cost, rtol=1e-5, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", MOSTLY)
 def test_bounds_that_coincide_are_equalities(solver: str) -> None:
     """Of the last state and of the controls of four stages; multipliers have the signs of an inequality's."""

@@ -39,6 +39,7 @@ PROBLEMS = {  # the cost at rest, and one that is known to exist
 }  # fmt: skip
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("solver", ["gco", "interior_point"])
 @pytest.mark.parametrize("native", [pytest.param(True, marks=compiled), pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", PROBLEMS)

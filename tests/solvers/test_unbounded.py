@@ -38,6 +38,7 @@ def away(*constraints: Constraint) -> Problem:
     return problem(lambda x, u: 0.01 * u[..., 0].square() - x[..., 0].square(), lambda x: 0 * x[..., 0], *constraints)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("form", [linear, away], ids=["linear", "negative definite"])
 def test_costs_without_an_end(solver: str, form) -> None:
@@ -82,6 +83,7 @@ def cake(*constraints: Constraint) -> Problem:
     return Problem(model, cost, constraints, torch.linspace(0.5, 100, 64, dtype=D).unsqueeze(-1), 30)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("guess", mostly([0.01, 1.0], 1.0))
 def test_a_cost_that_falls_like_a_logarithm(solver: str, guess: float) -> None:
@@ -157,6 +159,7 @@ def test_a_pole_that_bounds_keep_away(solver: str) -> None:
     assert found.statuses == [Status.CONVERGED] * 16, found
 
 
+@pytest.mark.slow
 def test_where_a_cost_ends_its_slope_leads_to_no_pole() -> None:
     """Minima, kinks and jumps down the slope: near them less and less is gained."""
     model = FunctionDynamics(lambda x, u: u, 1, 1, 0.1, "none")

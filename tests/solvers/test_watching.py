@@ -17,6 +17,7 @@ from torchgco.solvers.contracts import Progress
 ROW = re.compile(r"row +(\d+) (\w+) +(\d+) problems?; all in all (\d+) feasible, (\d+) at the goal; [\d.]+ s")
 
 
+@pytest.mark.slow
 def test_a_line_for_every_row_that_worked_and_one_at_the_end(capsys: pytest.CaptureFixture[str]) -> None:
     problem, U0 = gates()
     solver = quick_gco(problem)

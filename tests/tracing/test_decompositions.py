@@ -117,6 +117,7 @@ def compared(function: Function, curved: bool) -> None:
             torch.testing.assert_close(H, torch.autograd.functional.hessian(total, point), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.sampled(15)
 @pytest.mark.parametrize("name", SMOOTH)
 def test_values_and_derivatives_are_those_of_pytorch(name: str) -> None:
     compared(SMOOTH[name], True)

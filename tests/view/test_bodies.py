@@ -1,6 +1,7 @@
 """Vehicles with a body on the page: the box or the balls, turned as the body is, and obstacles that aren't grown."""
 
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
@@ -68,6 +69,7 @@ def test_obstacles_keep_their_size() -> None:
     np.testing.assert_allclose(shapes.radius, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_page_draws_a_body(chromium, tmp_path) -> None:
     problem = drive(Body.covering([-0.9, -0.3], [0.5, 0.3], [4, 2]))
     path = tmp_path / "body.html"

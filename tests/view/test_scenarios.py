@@ -83,6 +83,7 @@ SCENARIOS = [
 ]  # fmt: skip
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_scenario_has_its_page(scenario: str, flown: Callable[..., Path], opened: Tab) -> None:
     count = "study.layouts=null" if scenario == "map" else "study.layouts=2"

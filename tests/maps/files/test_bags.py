@@ -74,6 +74,7 @@ def test_folders(tmp_path: Path) -> None:
         read(tmp_path, topic="/map")
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", [kind for kind in bags.KINDS if kind != "folder"])
 def test_damaged_bags(kind: str, tmp_path: Path) -> None:
     name, data = bags.bag(kind)

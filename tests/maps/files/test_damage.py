@@ -32,6 +32,7 @@ def test_cut_at_every_length(name: str, tmp_path: Path) -> None:
         attempt(path, data[:length], options)
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("name", samples.SAMPLES)
 def test_changed_bytes(name: str, tmp_path: Path) -> None:
     data, options = samples.SAMPLES[name]
@@ -80,6 +81,7 @@ def bt(nodes: bytes) -> bytes:
     return data[: data.index(b"data\n") + 5].replace(b"size 34", b"size 2") + nodes
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", ["png", "pgm", "npy", "npz", "packed pcd", "heights", "bt", "yaml"])
 def test_sizes_are_checked_before_memory_is_taken(kind: str, tmp_path: Path) -> None:
     name, data, options = bomb(kind)

@@ -222,6 +222,7 @@ def test_trees_with_colours_and_times(tmp_path: Path) -> None:
         np.testing.assert_array_equal(grid_of(tmp_path / "other.ot").occupied, plain.occupied)
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize(("changed", "said"), [
     ({"resolution": None}, "no resolution"),
     ({"resolution": 0}, "resolution > 0"),
