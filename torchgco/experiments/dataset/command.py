@@ -40,12 +40,8 @@ from torchgco.scenarios.stored_maps import MAP_ARRAYS, map_arrays
 
 COMMAND = "torchgco-dataset"
 LeftOut = Literal["X", "K", "multipliers"]
-BEFORE = (
-    ".",
-    PART[0],
-    "run.json",
-    "run-",
-)  # how the names of files begin that a start leaves before it claims a folder
+# How the names of files begin that a start leaves before it claims a folder.
+BEFORE = ".", PART[0], "run.json", "run-"
 UNKNOWN = "unknown"  # license of a data set whose maker says none
 # Options of a study that have nothing to decide here, with the values that leave them alone.
 UNUSED = {"explain": False, "view": False, "figure": None, "objective": None}
