@@ -39,9 +39,9 @@ def text(flights: pd.DataFrame, peers: pd.DataFrame, families: Sequence[Family],
     every = [known, *peer_flights(references)]
     sets, optima = set_table(every, families), known_table(known, references, families, seed)
     mine = chosen(sets, SHOWN, solver=[*dict.fromkeys(flights.solver)])
-    theirs = chosen(sets, SHOWN, set=("all",), solver=(REST, BEST, FATROP)).split("\n", 2)[2]  # below the same head
+    theirs = chosen(sets, SHOWN, set=("all",), solver=(REST, BEST, FATROP)).split("\n")[2:]  # below the same head
     parts = [
-        ("Sets", filed("general-sets", sets, f"{mine}\n{theirs}")),
+        ("Sets", filed("general-sets", sets, "\n".join([mine, *theirs]))),
         ("Known optima", optima and filed("general-known", optima)),
         ("Statuses", honesty_table(known)),
         ("Families", filed("general-families", family_table(known, references, families, seed))),

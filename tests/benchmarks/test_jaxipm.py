@@ -10,7 +10,7 @@ import torch
 from benchmarks.outside.jaxipm import MX, OURS, PUBLISHED, TOLERANCE, by_ipopt, extremes, main, versus
 from benchmarks.outside.jaxipm_problems import SCENARIOS, Scenario, centers, spread
 from tests.slow import mostly
-from torchgco import Status
+from torchgco import Status, judge
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.quality import violation
 
@@ -86,7 +86,11 @@ def test_two_instances_are_solved_to_the_published_tolerance(name: str) -> None:
     X0, U0 = scenario.guess(some)
     found = OURS.solve(scenario.problem(some), U0, X0=X0)
     cost, worst = scenario.counted(some, found.U.numpy())
-    assert found.statuses == [Status.CONVERGED] * 2 and worst.max() <= TOLERANCE
+    assert worst.max() <= TOLERANCE
+    # The published swaps have no rows between the knots, where the optimum brings its vehicles nearer than 1 m.
+    apart = judge(scenario.problem(some), found.U).clearance >= 0
+    assert found.statuses == [Status.CONVERGED if clear else Status.INFEASIBLE for clear in apart.tolist()]
+    assert bool(apart.all()) == (scenario.family != "swap")
     np.testing.assert_allclose(cost[0], KNOWN[scenario.name], rtol=1e-6)
 
 

@@ -88,8 +88,10 @@ def test_a_section_gives_whole_rows(section, tmp_path: Path) -> None:
     assert all(row["quantity"] and row["case"] and row["solver"] and row["commit"] for row in rows)
     with (tmp_path / "results.part.csv").open(newline="") as file:
         assert list(csv.DictReader(file)) == rows  # each row is written when it is measured
-    for case, solver in {(row["case"], row["solver"]) for row in rows}:
-        assert f"| {case} | `{solver}` |" in section_table(rows)
+    cases = {(row["case"], row["solver"]) for row in rows}
+    several = len({solver for _, solver in cases}) > 1  # one solver has no column
+    for case, solver in cases:
+        assert (f"| {case} | `{solver}` |" if several else f"| {case} | ") in section_table(rows)
 
 
 @pytest.mark.slow

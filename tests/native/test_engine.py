@@ -156,7 +156,7 @@ def running_state(
 def eager(inner: ILQR, state: State, lagrangian: Lagrangian, count: int) -> dict[int, tuple[bool, bool, int]]:
     """PyTorch iterations until each problem ends or made `count`: per problem (converged, stuck, iterations)."""
     ends: dict[int, tuple[bool, bool, int]] = {}
-    for _ in range(3 * count):
+    for _ in range(20 * count):  # a factorisation that fails is tried again, from a mu_r of 1e-6 up to 1e8 by tens
         frozen = replace(state)
         end = iterate(inner.descent, state, lagrangian)
         for b in range(lagrangian.problem.B):

@@ -189,7 +189,7 @@ def test_made_once(monkeypatch) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
     assert done.stdout.split() == [first.key, "False", str(len(first.code))]
-    monkeypatch.setattr(made_by, "_made", None)
+    monkeypatch.setattr(made_by, "step_parts", None)
     assert trace_dynamics(Planar(drag=2.0)) == first
     again = trace_dynamics(Planar(drag=each(3.0, 4.0)))
     assert again == each_own  # the same code, other parameters
