@@ -27,7 +27,7 @@ FOLDER = "torchgco.experiments.results.folder.StudyFolder"
 # A phase lasts while one of its functions runs, except for phases inside it.
 PHASES = {
     "solve": ["torchgco.solvers.contracts.Solver.solve"],
-    "judge": ["torchgco.experiments.flying.flight.judge", "torchgco.experiments.flying.flight.certify"],
+    "judge": ["torchgco.experiments.flying.flight.judged_columns", "torchgco.experiments.flying.flight.certify"],
     "draw layouts": ["torchgco.scenarios.base.Scenario.draw"],
     "make problems": ["torchgco.scenarios.vehicle.Vehicle.task"],
     "progress": ["torchgco.experiments.flying.flight.SolveBatch._progress"],
@@ -55,7 +55,7 @@ def direct(count: int, shard_size: int) -> None:
         kernels_of(task.problem)
         solver = setup.solver.prepare(task.problem).in_slots(plan_batch(task.problem))
         solution = solver.solve(task.problem, task.U0, seed=setup.seed, ids=torch.as_tensor(part.ids))
-        verdict = flight.judge(task.problem, solution.U, task.goal, task.goal_radius)
+        verdict, _ = flight.judged_columns(task, solution.U, None)
         flight.certify(task.problem, solution.X, solution.U, verdict.feasible)
 
 
