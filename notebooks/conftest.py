@@ -2,8 +2,8 @@
 
 import pytest
 
-# 20 to 40 s of processor time each; what they show is tested elsewhere, too
-LONG = ("learning.ipynb", "maps.ipynb", "missions.ipynb")
+# 20 to 75 s of processor time each; what they show is tested elsewhere, too
+LONG = ("learning.ipynb", "maps.ipynb", "missions.ipynb", "paper.ipynb")
 
 
 @pytest.hookimpl(tryfirst=True)

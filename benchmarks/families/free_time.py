@@ -10,115 +10,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import torch
-from torch import Tensor
 
 import torchgco
 from benchmarks.lib.command import Command
+from benchmarks.lib.forms import INF, Form
 from benchmarks.lib.page import chosen, filed, markdown, share
-from torchgco import (
-    ControlBounds,
-    FreeTime,
-    FunctionConstraint,
-    FunctionCost,
-    FunctionDynamics,
-    Problem,
-    StateBounds,
-    Status,
-)
+from torchgco import Status
 
-D, INF = torch.float64, math.inf
 EXACT = 1e-3  # share of the least time, of equal stages of which one holds the switch
-
-
-@dataclass(frozen=True)
-class Form:
-    """A problem of free time that PyTorch and CasADi state from the same lines.
-
-    Attributes:
-        rates: x' of lists of states and controls, with the functions of a module (`torch` or `casadi`).
-        start, end: of states; None in `end` is free.
-        control, state: their bounds.
-        times: least and most, s.
-        value: what is minimised, of the last states and the duration.
-        guess: states at a share of the time, and controls, of COPS.
-    """
-
-    rates: Callable[[Sequence[Any], Sequence[Any], Any], list[Any]]
-    start: Sequence[float]
-    end: Sequence[float | None]
-    control: tuple[Sequence[float], Sequence[float]]
-    state: tuple[Sequence[float], Sequence[float]] | None
-    times: tuple[float, float]
-    value: Callable[[Sequence[Any], Any], Any] = lambda x, T: T
-    weight: float = 1.0
-    guess: Callable[[float], Sequence[float]] | None = None
-    U0: Sequence[float] | None = None
-
-    def problem(self, N: int, nominal: float, x0: Tensor | None = None, guess: Tensor | None = None) -> Problem:
-        """The problem with `FreeTime`; x0 (B, n) in place of the start, guess (B,) of the duration, s."""
-        n, m = len(self.start), len(self.control[0])
-        field = lambda x, u: torch.stack(self.rates(x.unbind(-1), u.unbind(-1), torch), -1)
-        fixed = [i for i, x in enumerate(self.end) if x is not None]
-        end = torch.tensor([self.end[i] for i in fixed], dtype=D)
-        rows = [
-            ControlBounds(*self.control),
-            FunctionConstraint(lambda x: x[..., fixed] - end, "equality", knots=[-1], name="end"),
-            *([] if self.state is None else [StateBounds(*self.state)]),
-        ]
-        last = None if self.weight > 0 else lambda x: self.value(x.unbind(-1), 0.0)
-        cost = FunctionCost(lambda x, u: 0.0 * u[..., 0], last)
-        least, most = (bound / nominal for bound in self.times)
-        factor = None if guess is None else (guess / nominal).clamp(least, most)
-        model = FunctionDynamics(field, n, m, nominal / N, "rk4")
-        x0 = torch.tensor([self.start], dtype=D) if x0 is None else x0
-        return Problem(model, cost, rows, x0, N, time=FreeTime(least, most, self.weight, factor))
-
-    def by_hand(self, N: int) -> ca.Function:
-        """IPOPT for this problem; variables T, x_0, u_0, x_1, ..., x_N, and x_0 as the parameter."""
-        n, m = len(self.start), len(self.control[0])
-        x, u, h = ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("h")
-        f = lambda z: ca.vertcat(*self.rates(ca.vertsplit(z), ca.vertsplit(u), ca))
-        k1 = f(x)
-        k2 = f(x + h / 2 * k1)
-        k3 = f(x + h / 2 * k2)
-        step = ca.Function("step", [x, u, h], [x + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(x + h * k3))])
-        T, X, U, x0 = ca.SX.sym("T"), ca.SX.sym("X", n, N + 1), ca.SX.sym("U", m, N), ca.SX.sym("x0", n)
-        rows = [X[:, 0] - x0, *(X[:, k + 1] - step(X[:, k], U[:, k], T / N) for k in range(N))]
-        v = ca.vertcat(T, *(ca.vertcat(X[:, k], U[:, k]) for k in range(N)), X[:, N])
-        quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 3000, "tol": 1e-8}}
-        value = self.value(ca.vertsplit(X[:, N]), T)
-        return ca.nlpsol("solver", "ipopt", {"x": v, "p": x0, "f": value, "g": ca.vertcat(*rows)}, quiet)
-
-    def hand_solved(
-        self, solver: ca.Function, N: int, x0: np.ndarray, states: Callable[[float], Sequence[float]], T0: float
-    ) -> tuple[bool, float, np.ndarray, int]:
-        """Whether IPOPT succeeds, the duration, the last states, and iterations."""
-        low, high = self.state or ([-INF] * len(x0), [INF] * len(x0))
-        u0 = self.U0 or [0.0] * len(self.control[0])
-        guess, lower, upper = [np.array([T0])], [np.array([self.times[0]])], [np.array([self.times[1]])]
-        for k in range(N + 1):
-            free = k == 0
-            guess.append(np.asarray(states(k / N), dtype=float))
-            fixed = [(-INF, INF) if e is None else (e, e) for e in self.end]
-            bounds = fixed if k == N else list(zip(low, high, strict=True))
-            pairs = [(-INF, INF)] * len(x0) if free else bounds
-            lower.append(np.array([p[0] for p in pairs]))
-            upper.append(np.array([p[1] for p in pairs]))
-            if k < N:
-                guess.append(np.array(u0))
-                lower.append(np.array(self.control[0]))
-                upper.append(np.array(self.control[1]))
-        found = solver(
-            x0=np.concatenate(guess), p=x0, lbx=np.concatenate(lower), ubx=np.concatenate(upper), lbg=0.0, ubg=0.0
-        )
-        v, stats = np.array(found["x"]).ravel(), solver.stats()
-        return bool(stats["success"]), float(v[0]), v[-len(x0) :], int(stats["iter_count"])
 
 
 def cart(fastest: float) -> Form:
@@ -185,8 +89,8 @@ def _by_ipopt(form: Form, hand: ca.Function, N: int, x0: np.ndarray, times: np.n
     for x, T0 in zip(x0, times, strict=True):
         ends.append(form.hand_solved(hand, N, x, lambda s, x=x: (1.0 - s) * x, float(np.clip(T0, *form.times))))
     spent = (time.process_time() - began) / len(x0)
-    hits = sum(done and abs(T / t - 1.0) < EXACT for (done, T, _, _), t in zip(ends, best, strict=True))
-    counts = [count for *_, count in ends]
+    hits = sum(done and abs(T / t - 1.0) < EXACT for (done, T, *_), t in zip(ends, best, strict=True))
+    counts = [count for *_, count, _ in ends]
     return f"{hits}; {np.median(counts):.0f} ({max(counts)}); {1e3 * spent:.0f}"
 
 
@@ -230,11 +134,11 @@ COPS: dict[str, tuple[Form, float, float, tuple[int, int]]] = {
     ),
     "rocket": (
         Form(_rocket, [1, 0, 1], [None, None, 0.6], ([0], [3.5]), ([1, 0, 0.6], [INF, INF, 1]), (0.001, 1.0),
-             lambda x, T: -x[0], 0.0, lambda s: [1, s * (1 - s), 1 - 0.4 * s], [1.75]), 0.1, 1.01283, (100, 400),
+             lambda x: -x[0], 0.0, lambda s: [1, s * (1 - s), 1 - 0.4 * s], [1.75]), 0.1, 1.01283, (100, 400),
     ),
     "glider": (
         Form(_glider, [0, 10, 1.323, -0.1288], [None, 9, 1.323, -0.1288], ([0], [1.4]),
-             ([0, -INF, 0, -INF], [INF] * 4), (10.0, 300.0), lambda x, T: -x[0], 0.0,
+             ([0, -INF, 0, -INF], [INF] * 4), (10.0, 300.0), lambda x: -x[0], 0.0,
              lambda s: [13.23 * s, 10 - s, 1.323, -0.1288], [0.7]), 100.0, 12.4803, (100, 200),
     ),
 }  # fmt: skip
@@ -253,7 +157,7 @@ def cops() -> str:
             value = float(found.duration[0] if form.weight > 0 else found.X[0, -1, 0])
             hand = form.by_hand(N)
             began = time.process_time()
-            done, T, last, count = form.hand_solved(
+            done, T, last, count, _ = form.hand_solved(
                 hand, N, np.array(form.start, dtype=float), form.guess or (lambda s: [s]), nominal
             )
             theirs = T if form.weight > 0 else last[0]

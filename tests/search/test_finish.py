@@ -142,3 +142,16 @@ def test_a_guess_that_breaks_the_bounds_starts_in_their_middle() -> None:
     problem = Problem(model, cost, [bounds], torch.ones(1, 2, dtype=D), 5)
     torchgco.solve(problem, solver=Watch())
     assert torch.equal(seen[0], torch.tensor([0.0, 0.3], dtype=D).expand(1, 5, 2))
+
+
+def test_what_has_no_constraints_is_solved_to_its_end_too() -> None:
+    """The integral of the cost is a state, so that the last knot alone has a cost: AL-iLQR crawls."""
+
+    def rates(x: Tensor, u: Tensor) -> Tensor:
+        p, v, u = x[..., 0], x[..., 1], u[..., 0]
+        return torch.stack((v, (1 - p.square()) * v - p + u, 0.5 * (p.square() + v.square() + u.square())), dim=-1)
+
+    x0 = torch.cat((torch.randn(16, 2, generator=torch.Generator().manual_seed(0), dtype=D), torch.zeros(16, 1)), -1)
+    cost = FunctionCost(lambda x, u: 0.0 * u[..., 0], lambda x: x[..., 2])
+    solution = torchgco.solve(Problem(FunctionDynamics(rates, 3, 1, 0.02, "rk4"), cost, [], x0, 100), verbose=False)
+    assert solution.statuses == [Status.CONVERGED] * 16

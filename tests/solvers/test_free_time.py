@@ -493,3 +493,28 @@ def test_a_time_that_is_too_short_for_all_or_some(name: str, most: float) -> Non
     late = (~possible).nonzero().flatten()
     alone = torchgco.solve(problem.take(late), solver=name, ids=late, verbose=False)
     assert_same_bits(alone, found.take(late))
+
+
+def test_no_time_is_thought_to_be_too_short_where_the_first_guess_is_a_saddle() -> None:
+    """x' = y u - 0.75 u^2, y' = u - y: without control no control has a slope, and at most it takes long to get far.
+
+    A particle that an electric field draws (Chang, Petit and Rouchon, 2006).
+    """
+
+    def rates(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        u = u[..., 0]
+        return torch.stack((x[..., 1] * u - 0.75 * u.square(), u - x[..., 1]), dim=-1)
+
+    ends = torch.tensor([[1.5], [2.0], [2.5], [3.0]], dtype=D)
+    model = FunctionDynamics(rates, 2, 1, 1.0 / 60, "rk4")
+    rows = [
+        ControlBounds(-1, 1),
+        FunctionConstraint(lambda x, end: x[..., :1] - end, "equality", knots=[-1], name="end", values={"end": ends}),
+    ]
+    free = FunctionCost(lambda x, u: 0.0 * u[..., 0])
+    x0 = torch.tensor([[1.0, 0.0]], dtype=D).expand(4, 2)
+    problem = Problem(model, free, rows, x0, 60, time=FreeTime(0.1, 40.0))
+    solution = torchgco.solve(problem, verbose=False)
+    assert solution.statuses == [Status.CONVERGED] * 4
+    best = torchgco.solve(problem, torch.full((4, 60, 1), 0.5, dtype=D), verbose=False)  # which tells the way
+    assert solution.duration.tolist() == pytest.approx(best.duration.tolist(), rel=1e-4)

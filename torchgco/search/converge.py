@@ -46,10 +46,9 @@ class Converge(Row):
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem = search.call.problem
-        if not self.worth(problem):
-            return
         if self.among == "all":
-            self._tighten(search)
+            if find_compiler() is not None:
+                self._tighten(search)
         elif self.begins(problem) and not search.begun:
             guess = guessed(search.call)
             found = search.interior.solved(search.call, guess=guess, escapes=True)

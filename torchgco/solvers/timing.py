@@ -284,8 +284,9 @@ class Timed:
         """Take the time as a variable from trajectories of drawn controls in drawn times about the one found.
 
         Least times are local: of controls that turn a thrust there are many. Where nothing has converged yet, each
-        guess is solved. Elsewhere, but for problems that look convex, all are solved roughly, side by side; the best of
-        each problem is solved on where it may be better than what is known.
+        guess is solved; where nothing is feasible, the time found says nothing, and all that are allowed are drawn.
+        Elsewhere, but for problems that look convex, all are solved roughly, side by side; the best of each problem is
+        solved on where it may be better than what is known.
         """
         user, best = self.problem, self.best
         if self.chooser.starts == 0 or self.call.late:
@@ -320,7 +321,10 @@ class Timed:
         U = controls_of(user, U, DRAWN_CONTROLS * smooth_normal(of_controls, KNOTS, U))
         factors = factors_in(user, self.best.X[each])
         pace = standard_normal(of_time, 1, range(1), factors.dtype)[0]
-        guess = (factors * torch.exp2(DRAWN_TIMES * pace)).clamp(self.time.least[each], self.time.most[each])
+        least, most = self.time.least[each], self.time.most[each]
+        guess = (factors * torch.exp2(DRAWN_TIMES * pace)).clamp(least, most)
+        lost = ~(self.best.violation[each] <= self.chooser.limit).unsqueeze(-1)
+        guess = torch.where(lost, least * (most / least) ** torch.special.ndtr(pace), guess)
         x0 = call.problem.x0.clone()
         x0[:, user.n] = guess[:, 0]
         lifted = call.problem._with({"x0": x0}, call.problem.known)
