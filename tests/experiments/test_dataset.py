@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -148,6 +149,18 @@ def test_the_card_names_every_column_the_counts_and_the_license(tmp_path: Path) 
     status = rows["status"].iloc[0]
     assert f"| {status} | {(rows['status'] == status).sum()} |" in text
     assert "| X | double | (6, 6) |" in text and "heading [rad]" in text
+
+
+@pytest.mark.parametrize(
+    "layouts", [[True, False, True], np.array([False, True]), [0.5, 1.0], np.array([1.0]), ["0"], [None]]
+)
+def test_layouts_are_asked_for_by_whole_numbers(layouts: Any, tmp_path: Path) -> None:
+    """A mask would be read as the layouts 0 and 1, and 0.5 as 0."""
+    pq.write_table(pa.table({"layout": [0, 1, 2], "cost": [3.0, 4.0, 5.0]}), tmp_path / "layouts-0-2.parquet")
+    with pytest.raises(InputError, match="layouts: expected whole numbers of layouts"):
+        torchgco.read_dataset(tmp_path, layouts=layouts)
+    for some in ([2, 0], range(3), np.array([1], np.uint8), []):
+        assert torchgco.read_dataset(tmp_path, layouts=some)["layout"].tolist() == sorted(some)
 
 
 @pytest.mark.slow

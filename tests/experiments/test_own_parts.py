@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 import torchgco
 from tests.experiments.commands import problem_line
 from torchgco.experiments.dataset import command
+from torchgco.experiments.flying.metrics import metric_columns
 from torchgco.experiments.reports.report import main as report
 
 OWN = '''
@@ -184,6 +186,28 @@ def test_what_is_wrong_is_named_in_a_line(run, words: list[str], word: str, line
 def test_fleets_and_missions_have_no_metrics(run, more: list[str]) -> None:
     code, _, err = run(*more, "study.layouts=1", "+study.metrics.way=own_parts.way")
     assert code == 2 and "study.metrics: expected null for missions and fleets, got way" in problem_line(err)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_metric_that_writes_into_its_arguments_changes_no_other(seed: int) -> None:
+    draws = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.rand(*shape, generator=draws, dtype=torch.float64)
+    problem = torchgco.Problem(
+        torchgco.Unicycle(dt=0.1), torchgco.QuadraticCost([1.0] * 4, [1.0] * 2, [1.0] * 4), [], draw(3, 4), 6,
+        horizon=torch.randint(2, 7, (3,), generator=draws),
+    )  # fmt: skip
+
+    def writes(X, U, t, problem):
+        for argument in (X, U, t):
+            argument.fill_(torch.inf)
+        return X[:, 0, 0]
+
+    metrics = {"end": lambda X, U, t, p: X[:, -1, 0], "effort": lambda X, U, t, p: U.square().sum((1, 2)),
+               "last": lambda X, U, t, p: t[:, -1]}  # fmt: skip
+    U = draw(3, 6, 2)
+    want = metric_columns(metrics, problem, U, None, range(3))
+    found = metric_columns({"writes": writes, **metrics}, problem, U, None, range(3))
+    assert all(np.isfinite(want[name]).all() and np.array_equal(found[name], want[name]) for name in metrics)
 
 
 def test_a_data_set_has_the_metrics_too(words: list[str], tmp_path: Path) -> None:

@@ -7,9 +7,11 @@ import pytest
 
 from tests.trials import flights, manifest, missions, trials
 from torchgco.base.errors import InputError
+from torchgco.experiments.reports.mission_view import _told
 from torchgco.experiments.reports.report import main, write_report
 from torchgco.experiments.results.kinds import TRAJECTORIES, format_report, joined, parts_of
 from torchgco.experiments.results.merge import merge
+from torchgco.experiments.statistics.missions import summarise_missions
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
 from torchgco.scenarios.layouts import Layouts
@@ -230,8 +232,23 @@ def test_the_numbers_of_missions_are_in_the_summary() -> None:
     ends = {name: row[f"{name}_count"] for name in ("reached", "collision", "timeout", "diverged")}
     assert ends == {"reached": 2, "collision": 1, "timeout": 1, "diverged": 0}
     assert (row["collision_low"], row["collision_high"]) == pytest.approx((0.0456, 0.6994), abs=1e-4)
-    assert row["flight_time"] == 5.5 and row["missed_deadlines"] == 2.5 and row["missions_at_once"] == 4
+    assert row["flight_time"] == 5.5 and row["missions_at_once"] == 4
     assert summary.loc["trajectory", "collision_count"] is pd.NA and summary["collision_count"].dtype == "Int64"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_deadlines_are_missed_by_missions_that_fly_alone(seed: int) -> None:
+    """Of a batch a period's time is divided by its missions: neither summary nor page says whether it was kept."""
+    draws = np.random.default_rng(seed)
+    missed, at_once = draws.integers(0, 50, 4).tolist(), int(draws.integers(2, 9))
+    for batch in (1, at_once):
+        flown = zip(missions("gco", "RRCT"), missed, strict=True)
+        rows = [row | {"missed_deadlines": n, "batch_size": batch} for row, n in flown]
+        table = trials(*rows)
+        told = summarise_missions(table)["missed_deadlines"].to_numpy()
+        pages = [dict(_told(row)).get("missed deadlines") for row in table.to_dict("records")]
+        np.testing.assert_array_equal(told, [np.mean(missed) if batch == 1 else np.nan])
+        assert pages == [str(n) if batch == 1 else None for n in missed]
 
 
 @pytest.mark.parametrize("form", ["csv", "json", "markdown", "latex"])

@@ -140,6 +140,7 @@ KINDS: dict[str, Callable[[], Problem]] = {
     "cones": lambda: point(Cone([1.0, 0.0, 0.0], 1.2, ("x", [3, 4, 5])), d=3),
     "a function": lambda: point(FunctionConstraint(lambda x, u: x[..., 2:3] * u[..., :1] - 2.0, of="xu")),
     "a required goal": lambda: point(goal=Goal(state=[0.8, 0.2, 0.0, 0.0], required=True)),
+    "a goal with free states": lambda: point(goal=Goal(state=[0.8, 0.2, np.nan, 0.1], required=True)),
     "a body": lambda: car(Spheres([[2.5, 0.8]], [0.3], BODY)),
     "a map": mapped,
     "a network": learned,

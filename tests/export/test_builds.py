@@ -42,6 +42,15 @@ def test_the_controller_is_the_same(folders: dict[str, Path], build: str) -> Non
     assert torch.equal(load_c(folders[build]).step(START), load_c(folders["cmake"]).step(START))
 
 
+def test_two_builds_of_one_controller_in_a_folder_are_refused(tmp_path: Path) -> None:
+    """One of them may be older."""
+    for build in ("cmake", "arduino"):
+        torchgco.export_c(problem(), tmp_path, name="car", build=build)
+    for name in (None, "car"):
+        with pytest.raises(InputError, match="got car, car in"):
+            load_c(tmp_path, name)
+
+
 @pytest.mark.parametrize("build", ["arduino", "zephyr"])
 def test_the_page_names_all_files(folders: dict[str, Path], build: str) -> None:
     text = (folders[build] / "README.md").read_text()

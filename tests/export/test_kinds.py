@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,13 @@ from tests.export.exported import exported, needs_compiler
 from tests.export.kinds import KINDS, START, N, car, point, reference
 from tests.slow import mostly
 from torchgco import (
+    Boxes,
     ControlBounds,
     FreeTime,
     FunctionConstraint,
     InputError,
     Link,
+    OscillatingBoxes,
     Problem,
     RateBounds,
     Spheres,
@@ -86,6 +89,7 @@ def test_only_chosen_numbers_change(tmp_path: Path) -> None:
         c.step(START, x_ref=reference()[1:])
 
 
+SWINGING = OscillatingBoxes(Boxes([[0.0, 0.6]], [[0.2, 0.1]], 0.1), [[[0.1, 0.2]]], [[[2.0, 1.0]]], [[[0.0, 0.5]]])
 REFUSED = {
     "several vehicles": (lambda: point().take([0, 0]), {}, "one vehicle"),
     "a free time": (lambda: point(time=FreeTime(least=0.5, most=2.0)), {}, "problem.time"),
@@ -99,6 +103,7 @@ REFUSED = {
     "x0": (point, {"changes": ["x0"]}, "x0"),
     "a computed number": (KINDS["boxes"], {"changes": ["half_sizes"]}, "half_sizes"),
     "a number": (lambda: 3, {}, "a Problem"),
+    "boxes that swing": (lambda: point(SWINGING), {}, r"constraints\[1\].*numbers that say where"),
 }  # fmt: skip
 
 
@@ -108,6 +113,16 @@ def test_what_cannot_go_is_refused_by_name_before_a_file_is_written(what: str, t
     with pytest.raises(InputError, match=told):
         torchgco.export_c(make(), tmp_path / "folder", **options)
     assert not (tmp_path / "folder").exists()
+
+
+@pytest.mark.parametrize("kind", ["moving spheres", "moved"])
+def test_places_of_what_moves_can_change_in_a_loop(kind: str, tmp_path: Path) -> None:
+    """As constants they would begin anew in every step; where the horizon stays, they are right."""
+    places = {"moving spheres": "centers", "moved": "places"}[kind]
+    for receding, asked in ((True, ["x_ref"]), (True, ["x_ref", places]), (False, ["x_ref"])):
+        text = (torchgco.export_c(KINDS[kind](), tmp_path, "k", receding, asked) / "k.h").read_text()
+        assert ["x_ref"] + [places] * receding == re.findall(r"double (\w+)\[\d+\]; /\* [\d x]+: ", text)
+    assert torchgco.export_c(point(SWINGING), tmp_path, receding=False) == tmp_path
 
 
 def test_functions_that_only_python_computes_are_refused(tmp_path: Path) -> None:

@@ -165,18 +165,38 @@ def test_a_bad_state_is_no_step(folder: Path, bad: float) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [("x_ref", np.nan), ("radii", -0.1), ("R", -1.0), ("constraints_0_upper", [-4.0, 0.5]), ("centers", np.inf),
-     ("constraints_0_lower", np.nan)],
+     ("constraints_0_lower", np.nan), ("constraints_0_lower", np.inf), ("constraints_0_upper", -np.inf),
+     ("constraints_2_upper", 1.0)],
 )  # fmt: skip
 def test_numbers_that_the_problem_cannot_have_are_refused(folder: Path, name: str, value: Any) -> None:
     c, x = load_c(folder), np.array([0.0, 0.0, 0.0, 3.0])
     c.step(x)
     before = c.numbers[name].copy()
     u = c.step(x, numbers={name: np.broadcast_to(value, c.numbers[name].shape)})
-    assert c.workspace.status == -2 and c.held and bool(torch.isfinite(u).all())
+    assert c.workspace.status == -2 and c.held
+    assert bool((u.abs() <= torch.tensor([3.0, 0.5])).all()), "a bound that can't be isn't kept"
     with pytest.raises(InputError, match="numbers"):
         c.status  # noqa: B018
     c.step(x, numbers={name: before})
     assert c.status == Status.CONVERGED
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_that_is_refused_changes_nothing(folder: Path, seed: int) -> None:
+    draws, c = np.random.default_rng(seed), load_c(folder)
+    c.step([0.0, 0.0, 0.0, 3.0])
+    new = {name: value + draws.uniform(0.0, 0.1, value.shape) for name, value in c.numbers.items()}
+    before, t = {name: value.copy() for name, value in c.numbers.items()}, c.t
+    name = str(draws.choice(list(new)))
+    for wrong, told in (
+        ({"numbers": new, name: new[name]}, f"each number once, got {name} twice"),
+        ({"numbers": new | {"nothing": 1.0}}, "got nothing"),
+        ({"numbers": new | {"x_ref": new["x_ref"][1:]}}, "x_ref: expected shape"),
+        ({"numbers": new, "t": -1.0}, "a time after"),
+    ):
+        with pytest.raises(InputError, match=told):
+            c.step([0.1, 0.0, 0.0, 3.0], **wrong)
+        assert all(np.array_equal(c.numbers[each], before[each]) for each in before) and c.t == t
 
 
 @pytest.mark.slow

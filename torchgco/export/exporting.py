@@ -12,6 +12,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.compiled import Compiled, compile
 from torchgco.compiled.in_free_time import KeptInTime
+from torchgco.compiled.motion import Motion
 from torchgco.constraints.norms import within_norms
 from torchgco.export.files import Build, Exported, write_files
 from torchgco.export.numbers import changing
@@ -53,8 +54,8 @@ def export_c(
         folder: is made if it isn't there; files of these names are overwritten.
         name: of files, types and functions: a word of C.
         receding: each step's horizon begins a stage after that of the step before; the example and the test move so.
-        changes: names of the numbers that steps may change; the others are constants. None: all that C reads as they
-            are or copies of.
+        changes: names of the numbers that steps may change, beside the places of obstacles that move where `receding`;
+            the others are constants. None: all that C reads as they are or copies of.
         build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
             "zephyr", a module with a sample. Of the last two NAME.h and NAME.c lie in `src`.
 
@@ -63,8 +64,9 @@ def export_c(
 
     Raises:
         InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
-            start, horizons, `RateBounds`, `Link` or `Integral`, single precision, code that can't be compiled; a number
-            that can't change. No file is written then.
+            start, horizons, `RateBounds`, `Link` or `Integral`, single precision, code that can't be compiled, where
+            `receding` obstacles that move without numbers that say where they are; a number that can't change. No file
+            is written then.
     """
     check_value(receding, bool, "receding")
     check_value(build, Build, "build")
@@ -77,7 +79,12 @@ def export_c(
         compiled = compile(_checked(problem), "interior_point")
     kept = _served(compiled)
     problem = kept.problem
+    places = Motion(problem).places if receding else []
+    if changes is not None:
+        changes = list(dict.fromkeys(compiled.numbers.find(name).name for name in [*changes, *places]))
     some = changing(kept, compiled.numbers, changes)
+    if lacking := sorted({*places} - {member.full for member in some.members}):
+        raise InputError("problem", "obstacles whose places C reads as they are, where they move", lacking[0])
     with torch.no_grad():
         rest = _guess_at_rest(problem)
     solver = solver_source(kept, some, compiled.interior, rest)

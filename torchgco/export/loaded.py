@@ -49,11 +49,11 @@ def load_c(folder: str | Path, name: str | None = None, period: float | None = N
         NativeError: there is no compiler, or it refuses the code.
     """
     folder = Path(folder)
-    headers = {path.stem: path for path in (*folder.glob("src/*.h"), *folder.glob("*.h"))}
-    found = sorted(stem for stem, path in headers.items() if path.with_suffix(".c").is_file())
+    paths = [path for path in (*folder.glob("src/*.h"), *folder.glob("*.h")) if path.with_suffix(".c").is_file()]
+    headers, found = {path.stem: path for path in paths}, sorted(path.stem for path in paths)
     if name is None and len(found) == 1:
         name = found[0]
-    if name not in found:
+    if name is None or found.count(name) != 1:  # two: of one name for two kinds of `build`
         raise InputError("folder", "one with a controller of `export_c`", f"{', '.join(found) or 'none'} in {folder}")
     code = headers[name].with_suffix(".c").read_text()
     return LoadedController(headers[name].read_text(), code, name, period)
@@ -149,15 +149,18 @@ class LoadedController:
         """The controls (m,) for the next period, from states x (n,) measured now; as of `MPC.step`.
 
         Raises:
-            InputError: states, a time or numbers that don't fit.
+            InputError: states, a time or numbers that don't fit. Nothing is changed then.
         """
         state = np.ascontiguousarray(measured(x, 1, self.n).reshape(self.n))
         later = self.period if t is None else t - self.t
         if t is not None and (not math.isfinite(t) or (self._begun and t <= self.t)):
             raise InputError("t", f"a time after {self.t:g} s", shown(t))
         limit = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
-        for name, value in {**(numbers or {}), **named}.items():
-            self._write(name, value)
+        if twice := (numbers or {}).keys() & named.keys():
+            raise InputError("numbers", "each number once", f"{min(twice)} twice")
+        new = {name: self._fitting(name, value) for name, value in {**(numbers or {}), **named}.items()}
+        for name, floats in new.items():
+            self._numbers[name][...] = floats
         stages = stages_between(later / self.dt) if self._begun else 0.0
         u = np.zeros(self.m)
         self.raw_step(state, stages, math.inf if limit is None else limit, u)
@@ -172,13 +175,13 @@ class LoadedController:
         seconds = ctypes.c_double(stages), ctypes.c_double(max_seconds)
         return int(self._functions["step"](ctypes.byref(self._workspace), state, *seconds, controls))
 
-    def _write(self, name: str, value: Any) -> None:
+    def _fitting(self, name: str, value: Any) -> Floats:
         if name not in self._numbers:
             raise InputError("numbers", f"one of {', '.join(self._numbers) or 'none'}", name)
         floats, there = as_floats(value, name), self._numbers[name]
         if floats.shape not in (there.shape, (1, *there.shape)):
             raise InputError(name, f"shape {there.shape}", floats.shape)
-        there[...] = floats
+        return floats
 
 
 def _layout(header: str) -> tuple[dict[str, tuple[int, ...]], Any]:

@@ -91,12 +91,15 @@ def read_dataset(
 
     Args:
         columns: which; None: all, with `layout` in any case. README.md in the folder says what each is.
-        layouts: which, by number; None: all. Only files with some of them are read: a large data set is read in parts.
+        layouts: which, by number, in any order; rows have their own. None: all. Only files with some of them are read:
+            a large data set is read in parts.
 
     Raises:
         InputError: no data set there, a damaged file, a column or layouts that it doesn't have.
     """
-    files, asked = files_of(Path(folder)), None if layouts is None else np.asarray(layouts, dtype=int)
+    files, asked = files_of(Path(folder)), None if layouts is None else np.asarray(layouts)
+    if asked is not None and asked.size and asked.dtype.kind not in "iu":  # a mask would be read as layouts 0 and 1
+        raise InputError("layouts", "whole numbers of layouts", f"numbers of type {asked.dtype}")
     if not files:
         raise InputError("folder", "a data set, with files such as layouts-000000000-000000511.parquet", folder)
     names = None if columns is None else list(dict.fromkeys(["layout", *columns]))

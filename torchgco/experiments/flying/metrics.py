@@ -59,8 +59,8 @@ def metric_columns(
     columns = {name: np.full(problem.B, np.nan) for name in metrics}
     for last in stages[finite].unique().tolist():
         rows = (finite & (stages == last)).nonzero().flatten()
-        flown = X[rows, : last + 1], U[rows, :last], t[rows, : last + 1], problem.take(rows)
-        for name, metric in metrics.items():
+        for name, metric in metrics.items():  # each gets copies of its own: one may write into them
+            flown = X[rows, : last + 1], U[rows, :last], t[rows, : last + 1], problem.take(rows)
             values = _values(f"study.metrics.{name}", metric, flown)
             if ids is not None and np.isnan(values).any():
                 number = np.asarray(ids)[rows.numpy()[np.isnan(values)]][0]

@@ -61,11 +61,6 @@ DIVIDED = (
 )
 
 
-def _missed(row: pd.Series) -> str:
-    """Missed deadlines; of a batch none, as its divided times don't decide them."""
-    return "-" if row[MISSIONS_AT_ONCE] > 1 else number("{:.1f}", "missed_deadlines")(row)
-
-
 TRAJECTORIES = Kind(
     "trajectory",
     summarise,
@@ -87,7 +82,7 @@ MISSIONS = Kind(
     summarise_missions,
     of="missions in ",
     rates={"n": number("{:d}", "n"), **{name: rate(name.lower()) for name in Outcome.__members__}},
-    effort={head: number(form, name) for head, form, name in MISSION_EFFORT} | {"missed": _missed},
+    effort={head: number(form, name) for head, form, name in MISSION_EFFORT},
     paper=[head for head, *_ in MISSION_EFFORT],
     compared=PAIR_CELLS,
     notes=RATES_TEXT,

@@ -26,7 +26,7 @@ def summarise_missions(trials: pd.DataFrame) -> pd.DataFrame:
             disjoint.
         <column>: for flight_time, energy, clearance, planner_seconds_median, planner_seconds_p99 and
             tracker_seconds_median: the median over the missions that reached the goal.
-        missed_deadlines, shifted_plans: means over all missions.
+        missed_deadlines, shifted_plans: means over all missions; of deadlines NaN where missions were planned together.
         missions_at_once: most missions that were planned as one batch, which all times are divided by.
 
     Raises:
@@ -45,7 +45,9 @@ def _of_missions(group: pd.DataFrame) -> dict[str, object]:
     reached = group[group["outcome"] == Outcome.REACHED.name]
     row |= {name: pd.Series(numbers_of(reached[name])).median() for name in MEDIANS}
     row |= {name: float(numbers_of(group[name]).mean()) for name in MEANS}
-    return row | {MISSIONS_AT_ONCE: int(group["batch_size"].max())}
+    if (at_once := int(group["batch_size"].max())) > 1:
+        row["missed_deadlines"] = np.nan  # the divided times of a batch don't decide them
+    return row | {MISSIONS_AT_ONCE: at_once}
 
 
 def mission_lines(trials: pd.DataFrame) -> str:

@@ -45,44 +45,6 @@ static double rounded(double stages) {
     return fabs(stages - whole) <= STAGE_ROUNDING * size ? whole : stages;
 }
 
-/* u within the bounds of controls at knot k; what is no number becomes 0 first. */
-static void clamp(const Solve *b, int64_t k, double *u) {
-    const Problem *p = &b->problem;
-    for (int j = 0; j < NU; j++) if (u[j] != u[j]) u[j] = 0;
-    for (int side = -1; side <= 1; side += 2)
-        for (int64_t i = 0; i < p->constraints; i++) {
-            const Constraint *con = p->constraint + i;
-            if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
-            const double *limit = con->bound.data + (con->bound.knot ? con->place[k] * con->bound.size : 0);
-            for (int j = 0; j < con->rows; j++) {
-                if (con->variable[j] < NX || con->sign[j] != side) continue;
-                double *own = u + con->variable[j] - NX;
-                if (side < 0 ? *own < limit[j] : *own > limit[j]) *own = limit[j];
-            }
-        }
-}
-
-/* Whether one of the numbers is one that the problem can't have. */
-static int has_bad_number(const NAME_workspace *w, const Solve *b) {
-    const double *numbers = (const double *)(const void *)&w->numbers;
-    for (int i = 0; i < (int)(sizeof checks / sizeof *checks); i++)
-        for (int j = checks[i].first; j < checks[i].first + checks[i].count; j++) {
-            int kind = checks[i].kind, is_finite_number = numbers[j] - numbers[j] == 0;
-            if (numbers[j] != numbers[j] || (kind != BOUND && !is_finite_number)) return 1;
-            if ((kind == AT_LEAST_ZERO && numbers[j] < 0) || (kind == ABOVE_ZERO && numbers[j] <= 0)) return 1;
-        }
-    for (int64_t i = 0; i < b->problem.constraints; i++) {
-        const Constraint *con = b->problem.constraint + i;
-        if (!is_kind(con, BOUNDS)) continue;
-        for (int64_t k = 0; k < (con->bound.knot ? con->knots : 1); k++) {
-            const double *limit = con->bound.data + k * con->bound.knot;
-            for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++)
-                if (are_a_pair(con, j, l) && limit[j] < limit[l]) return 1;
-        }
-    }
-    return 0;
-}
-
 /* The bounds of variable v by constraint `con` at knot k; infinite where there are none. */
 static void bounds_at(const Constraint *con, int64_t k, int v, double *lower, double *upper) {
     const double *limit = con->bound.data + (con->bound.knot ? con->place[k] * con->bound.size : 0);
@@ -91,6 +53,48 @@ static void bounds_at(const Constraint *con, int64_t k, int v, double *lower, do
         if (con->variable[j] != v || fabs(limit[j]) >= LOOSE) continue;
         *(con->sign[j] > 0 ? upper : lower) = limit[j];
     }
+}
+
+/* u within the bounds of controls at knot k, but for those that cross; what is no number becomes 0 first. */
+static void clamp(const Solve *b, int64_t k, double *u) {
+    const Problem *p = &b->problem;
+    for (int j = 0; j < NU; j++) if (u[j] != u[j]) u[j] = 0;
+    for (int side = -1; side <= 1; side += 2)
+        for (int64_t i = 0; i < p->constraints; i++) {
+            const Constraint *con = p->constraint + i;
+            if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
+            for (int j = 0; j < NU; j++) {
+                double lower, upper;
+                bounds_at(con, k, NX + j, &lower, &upper);
+                if (lower > upper) continue;
+                if (side < 0 ? u[j] < lower : u[j] > upper) u[j] = side < 0 ? lower : upper;
+            }
+        }
+}
+
+/* Whether one of the numbers is one that the problem can't have; 2: a bound is. */
+static int has_bad_number(const NAME_workspace *w, const Solve *b) {
+    const double *numbers = (const double *)(const void *)&w->numbers;
+    const double *exported = (const double *)(const void *)&exported_numbers;
+    for (int i = 0; i < (int)(sizeof checks / sizeof *checks); i++)
+        for (int j = checks[i].first; j < checks[i].first + checks[i].count; j++) {
+            int kind = checks[i].kind, is_finite_number = numbers[j] - numbers[j] == 0;
+            /* Free parts of a goal, and bounds that were infinite, have no rows. */
+            if (exported[j] != exported[j] && numbers[j] != numbers[j]) continue;
+            if (exported[j] - exported[j] != 0 && numbers[j] != exported[j]) return kind == BOUND ? 2 : 1;
+            if (numbers[j] != numbers[j] || (kind != BOUND && !is_finite_number)) return kind == BOUND ? 2 : 1;
+            if ((kind == AT_LEAST_ZERO && numbers[j] < 0) || (kind == ABOVE_ZERO && numbers[j] <= 0)) return 1;
+        }
+    for (int64_t i = 0; i < b->problem.constraints; i++) {
+        const Constraint *con = b->problem.constraint + i;
+        if (!is_kind(con, BOUNDS)) continue;
+        for (int64_t k = 0; k < (con->bound.knot ? con->knots : 1); k++) {
+            const double *limit = con->bound.data + k * con->bound.knot;
+            for (int j = 0; j < con->rows; j++) for (int l = j + 1; l < con->rows; l++)
+                if (are_a_pair(con, j, l) && limit[j] < limit[l]) return 2;
+        }
+    }
+    return 0;
 }
 
 /* What is done with a variable at a knot, z, that has bounds. */
@@ -419,7 +423,8 @@ int NAME_step(NAME_workspace *w, const double x[NX], double stages, double max_s
     bind(w, b);
     double until = seconds_of(&b->arena) + max_seconds;
     int good = 0, late = 0, guessed = w->able == 2, fits = stages >= 0 && stages - stages == 0;
-    int status = !fits || !all_finite(x, NX) ? NAME_BAD_STATE : has_bad_number(w, b) ? NAME_BAD_NUMBER : RUNNING;
+    int bad = has_bad_number(w, b);
+    int status = !fits || !all_finite(x, NX) ? NAME_BAD_STATE : bad ? NAME_BAD_NUMBER : RUNNING;
     w->warm = w->iterations = 0;
     if (fits && w->age >= 0) w->age += stages;
     if (fits && w->begun && !guessed && stages > 0) {
@@ -428,7 +433,7 @@ int NAME_step(NAME_workspace *w, const double x[NX], double stages, double max_s
 @SHIFTS@
     }
     if (status < 0) {
-        hold(w, b, status == NAME_BAD_STATE ? 0 : x, u);
+        hold(w, b, status == NAME_BAD_STATE || bad == 2 ? 0 : x, u); /* without bounds feedback has no end */
         w->held = 1;
         return w->status = status;
     }
