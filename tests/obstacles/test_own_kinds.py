@@ -21,7 +21,7 @@ from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.measured import along_ways
 from torchgco.obstacles.shapes import RoundedBoxes
 from torchgco.plotting.world import world_of
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import scene_of
 
 D = torch.float64
 BARS = 12  # around a ring, as the search and pictures see it

@@ -26,7 +26,7 @@ from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numb
 from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.numbers import Numbers
 from torchgco.constraints.integral import Integral
-from torchgco.explaining.account import Account
+from torchgco.explaining.explain import Account
 from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation

@@ -17,8 +17,7 @@ from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.interior import InteriorEngine
 from torchgco.native.kept import Kept
-from torchgco.problem.elapsed import Elapsed
-from torchgco.problem.in_time import factors_in, factors_of, in_time, states_in_time, times_of
+from torchgco.problem.in_time import Elapsed, factors_in, factors_of, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.tracing import own_tensors

@@ -17,7 +17,7 @@ from torchgco.base.tree import PerElement
 from torchgco.base.values import NO_VALUES, Values, bound_values
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.link import Link
-from torchgco.problem.binding import bound
+from torchgco.problem.given import bound
 from torchgco.problem.joined import mixes_problems
 from torchgco.problem.problem import Problem
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchgco.base.gradients import recording
 from torchgco.base.status import Status
 from torchgco.base.tree import passed_on
-from torchgco.explaining.account import Account
+from torchgco.explaining.explain import Account
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.phases.lowered import Whole

@@ -7,7 +7,7 @@ imports `roadmap`, `guidance` and `solvers`. Begin with `table.py`.
 
 from torchgco.search.candidates import Refine as Refine
 from torchgco.search.chords import ClearChords as ClearChords
-from torchgco.search.converge import Converge as Converge
+from torchgco.search.chords import Converge as Converge
 from torchgco.search.direct import Direct as Direct
 from torchgco.search.direct import Join as Join
 from torchgco.search.following import Follow as Follow

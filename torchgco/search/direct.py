@@ -18,15 +18,15 @@ from torch import Tensor
 
 from torchgco.base.options import Natural, NonNegative
 from torchgco.base.tree import take
+from torchgco.lagrangian.lagrangian import SolveEnd
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import has_maps
+from torchgco.roadmap.geometry import has_maps
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
-from torchgco.search.pursue import pursue
 from torchgco.search.search import Search
 from torchgco.search.table import Row
+from torchgco.search.tube import pursue
 from torchgco.solvers.contracts import Call
 
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 from torchgco.base.options import Count, Natural, Positive
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import Refine
-from torchgco.search.converge import Converge
+from torchgco.search.chords import Converge
 from torchgco.search.direct import Direct, Join
 from torchgco.search.following import Follow
 from torchgco.search.proposals import PathProposals

@@ -14,18 +14,16 @@ from torchgco.base.options import Count, Positive
 from torchgco.base.status import STOPPED, UNMOVED, Status, is_over
 from torchgco.base.tree import take
 from torchgco.kernels import is_convex, measured, open_loop
-from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.lagrangian import Iterate, Multipliers, SolveEnd
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goal
-from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
-from torchgco.search.chords import clear_further
-from torchgco.search.converge import Converge, continued, keep_clear, keep_tight, solved_nearby
+from torchgco.search.chords import Converge, clear_further, continued, keep_clear, keep_tight, solved_nearby
 from torchgco.search.reach import beyond_reach
 from torchgco.search.search import Search
 from torchgco.search.table import Row
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.drawn import KNOTS, STREAM, controls_of, half_ranges
+from torchgco.solvers.convexity import KNOTS, STREAM, controls_of, half_ranges
 from torchgco.solvers.ending import STATIONARY
 
 START_ROUNDS = 2  # one guess turns a car round between walls in 2 of 5 cases: all of 8 miss in 1.7 %, of 16 in 0.03 %

@@ -16,12 +16,11 @@ from torchgco.base.options import Count
 from torchgco.base.status import Status
 from torchgco.base.tree import take
 from torchgco.kernels import measured, path_clearance
+from torchgco.lagrangian.lagrangian import SolveEnd
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import TimedWays, library_for, timed_ways
-from torchgco.search.chords import EXTRA
-from torchgco.search.converge import solved_nearby
+from torchgco.search.chords import EXTRA, solved_nearby
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.reach import limit_of, push_of
 from torchgco.search.search import Search

@@ -11,7 +11,7 @@ from torchgco.problem.in_time import states_in_time
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.timed import TimedWays
-from torchgco.search.velocity import Velocity
+from torchgco.search.timed_scenes import Velocity
 
 SMALL = 1e-4  # change of a control by which its effect is looked at
 

@@ -10,9 +10,7 @@ from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import Bounds
 from torchgco.ilqr.riccati import backward
 from torchgco.kernels import cost_unit, measured
-from torchgco.lagrangian.expansion import linearise
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.lagrangian.lagrangian import Iterate, Lagrangian, Multipliers, SolveEnd, linearise
 from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.convexity import is_affine, looks_convex_row

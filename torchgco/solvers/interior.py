@@ -13,16 +13,15 @@ from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import bounds_of
 from torchgco.kernels import cost_scale, expect_interior, interior_of, measured, open_loop, rolled_out
 from torchgco.lagrangian.barrier import GOLDEN, BarrierOptions, least_violation
-from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.lagrangian import Iterate, Multipliers, SolveEnd
 from torchgco.lagrangian.quality import is_better
-from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.lagrangian.unmoved import unmoved
 from torchgco.native.compiler import NativeError
 from torchgco.native.interior import InteriorKernels
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
-from torchgco.solvers.drawn import half_ranges
+from torchgco.solvers.convexity import half_ranges
 from torchgco.solvers.ending import STATIONARY, start_status
 from torchgco.solvers.infeasible import least_violated
 from torchgco.solvers.session import Session
