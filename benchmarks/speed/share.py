@@ -30,7 +30,7 @@ CALLS = (
     "torchgco.kernels.outer.run",
     "torchgco.native.engine.run",
     "torchgco.native.interior.run",
-    "torchgco.native.sampler.run",
+    "torchgco.native.engine.run",
     "torchgco.roadmap.cheapest.GraphSearch._run",
 )
 PYTHON = "Python and PyTorch"

@@ -27,7 +27,7 @@ from torchgco import (
     solve,
 )
 from torchgco.base.errors import HorizonWarning
-from torchgco.dynamics.unicycle import Unicycle
+from torchgco.dynamics.planar import Unicycle
 from torchgco.kernels import path_clearance
 from torchgco.problem.times import bulge
 from torchgco.roadmap.timed import library_for

@@ -19,10 +19,9 @@ from torchgco.ilqr.step import Descent, keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
 from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
-from torchgco.native.engine import Engine
+from torchgco.native.engine import Engine, Sampler
 from torchgco.native.interior import InteriorEngine, InteriorKernels
-from torchgco.native.kept_descent import KeptDescent
-from torchgco.native.sampler import Sampler
+from torchgco.native.kept_problem import KeptDescent
 from torchgco.native.structures import Options
 from torchgco.obstacles.base import TOUCH
 from torchgco.obstacles.spheres import BoundSpheres

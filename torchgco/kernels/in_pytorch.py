@@ -20,7 +20,7 @@ from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, PassEnd, Stat
 from torchgco.lagrangian.quality import violation
 from torchgco.native.called import CalledInterior
 from torchgco.native.interior import InteriorKernels
-from torchgco.native.kept_descent import KeptDescent
+from torchgco.native.kept_problem import KeptDescent
 from torchgco.problem.problem import Problem
 
 

@@ -14,8 +14,7 @@ from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
-from torchgco.dynamics.rotors import QuadrotorThrusts
+from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning, QuadrotorThrusts
 from torchgco.kernels import current, open_loop
 from torchgco.missions.constraints import FirstStepRates
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles

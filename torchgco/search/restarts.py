@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from torchgco.base.errors import InputError
 from torchgco.base.options import check_options
 from torchgco.base.shapes import repeated
-from torchgco.guidance.gco import GCO
-from torchgco.guidance.suitability import check_form, failure, suited_guide, warn_of_losses
+from torchgco.guidance.gco import GCO, check_form, failure, suited_guide, warn_of_losses
 from torchgco.kernels import expect_interior, kernels_of
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, SolveEnd, linearise
 from torchgco.obstacles.base import Obstacles

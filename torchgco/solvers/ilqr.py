@@ -16,7 +16,7 @@ from torchgco.ilqr.line_search import LineSearch
 from torchgco.ilqr.step import Descent
 from torchgco.kernels import kernels_of, measured
 from torchgco.lagrangian.lagrangian import InnerState, Iterate, Lagrangian, Multipliers, PassEnd, SolveEnd
-from torchgco.native.kept_descent import KeptDescent
+from torchgco.native.kept_problem import KeptDescent
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution

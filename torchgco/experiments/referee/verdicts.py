@@ -12,9 +12,8 @@ import torch
 from torchgco.base.errors import InputError
 from torchgco.experiments.referee.controls import Controls
 from torchgco.experiments.results.durations import judged_columns, states_of, times_at
-from torchgco.experiments.results.folder import COLUMNS
+from torchgco.experiments.results.folder import COLUMNS, with_success
 from torchgco.experiments.results.identity import layout_digests
-from torchgco.experiments.results.success import with_success
 from torchgco.judging.certificate import certify
 from torchgco.judging.certificate import frame_columns as certificate_columns
 from torchgco.scenarios import Layouts, Task, Vehicle

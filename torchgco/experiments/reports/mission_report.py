@@ -18,16 +18,14 @@ from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import MISSION, PLANS_FILE, TIME_STEPS, TRIALS, read_trials
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables
 from torchgco.experiments.statistics.missions import mission_lines
-from torchgco.missions.contact import Contact
-from torchgco.missions.passing import Passing
+from torchgco.missions.contact import Contact, Passing
+from torchgco.missions.outcome import clearances, gates_passed, mission_frame, time_step_frame, unpacked
 from torchgco.missions.planning_problem import airframe_of
-from torchgco.missions.tables import clearances, gates_passed, mission_frame, time_step_frame, unpacked
 from torchgco.plotting import missions as draw
 from torchgco.plotting.animation import mission_animation
-from torchgco.plotting.bodies import bodies
+from torchgco.plotting.bodies import bodies, body_of
 from torchgco.plotting.course import Course
 from torchgco.plotting.gates import outlines
-from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.style import save
 
 SNAPSHOTS = 4  # instants of a mission in one figure

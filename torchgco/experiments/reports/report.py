@@ -34,12 +34,12 @@ from torchgco.experiments.statistics.power import in_words
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
 from torchgco.obstacles.base import Obstacles
+from torchgco.plotting.bodies import body_of
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.families import families_figure
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.missions import outcomes_figure
 from torchgco.plotting.rates import rates_figure, sweep_figure
-from torchgco.plotting.silhouettes import body_of
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
 from torchgco.scenarios import Layouts

@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 
 from torchgco.base.errors import InputError
+from torchgco.experiments.results.folder import judged
 from torchgco.experiments.results.identity import ARITHMETIC, digest, flat
 from torchgco.experiments.results.runs import DIGESTS, MERGED, ROW, Run, find_runs
-from torchgco.experiments.results.success import judged
 from torchgco.experiments.results.variants import column, labels, task_of_runs
 from torchgco.experiments.statistics.statistics import (
     OPTION,
