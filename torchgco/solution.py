@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.differentiability import Differentiability
 from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.gradients import without_gradients
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
-from torchgco.base.status import Status
+from torchgco.base.status import Differentiability, Status
 from torchgco.base.tree import moved, take
 from torchgco.explaining.explain import Account, Explanation, explanation
 from torchgco.explaining.record import Comparison as Comparison

@@ -23,8 +23,7 @@ from torchgco.search.chords import cleared, serving
 from torchgco.search.tube import radius_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.solvers.infeasible import least_violated
-from torchgco.solvers.interior import InteriorPoint, guessed
+from torchgco.solvers.interior import InteriorPoint, guessed, least_violated
 from torchgco.solvers.session import Session
 
 Array = NDArray[np.float64]

@@ -32,6 +32,8 @@ from torchgco.native.cuda import source as cuda
 from torchgco.native.cuda.engine import Kernel, Library, current_device
 from torchgco.native.cuda.source import SOLVER
 from torchgco.native.packing import (
+    Captured,
+    Shared,
     constraint_of,
     guide_of,
     is_bounded,
@@ -41,7 +43,6 @@ from torchgco.native.packing import (
     quadratic_arrays,
     shared_fields,
 )
-from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import Kind, array
 from torchgco.obstacles.spheres import SpheresInFreeTime
 from torchgco.problem.problem import Problem

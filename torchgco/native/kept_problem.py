@@ -11,8 +11,7 @@ from torchgco.base.status import Status
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native import structures as c
 from torchgco.native.engine import Engine, run
-from torchgco.native.packing import constraint_of, is_bounded, kind_of, shared_fields
-from torchgco.native.shared import Shared
+from torchgco.native.packing import Shared, constraint_of, is_bounded, kind_of, shared_fields
 from torchgco.native.structures import Kind
 from torchgco.problem.problem import Problem
 from torchgco.tracing import own_tensors

@@ -16,7 +16,7 @@ from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
 from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import Plane, Solid, balls_at, bodies, body_of, solids
 from torchgco.problem.problem import Problem
-from torchgco.scenarios.stored_maps import map_of
+from torchgco.scenarios.layouts import map_of
 
 Arrays = Mapping[str, np.ndarray]
 SLACK = 0.12  # share of the scene's size by which obstacles and flights that miss the goal may widen a map

@@ -24,7 +24,7 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.carried import Carrying, Taken
 from torchgco.costs.base import Cost, WrappedCost
-from torchgco.costs.in_free_time import QuadraticInFreeTime
+from torchgco.costs.quadratic import QuadraticInFreeTime
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.dynamics.integrators import INTEGRATORS
 from torchgco.problem.carried import carried_of, rows_of_one_knot

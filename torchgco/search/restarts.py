@@ -33,8 +33,7 @@ from torchgco.search.timed import Timed
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
-from torchgco.solvers.infeasible import least_violated
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, least_violated
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
 

@@ -16,7 +16,7 @@ from torchgco.base.draws import uniform
 from torchgco.base.shapes import repeated
 from torchgco.constraints.base import ADMITTED, Constraint
 from torchgco.constraints.gates import gates_of
-from torchgco.costs.in_free_time import QuadraticInFreeTime
+from torchgco.costs.quadratic import QuadraticInFreeTime
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem

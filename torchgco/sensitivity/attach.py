@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, computing_on
+from torchgco.base.status import Differentiability as Why
 from torchgco.base.status import Status
 from torchgco.base.tree import copied, is_users
 from torchgco.explaining.explain import Account

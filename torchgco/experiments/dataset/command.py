@@ -34,7 +34,7 @@ from torchgco.experiments.results.identity import decisive, difference, layout_d
 from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded, source
 from torchgco.scenarios import Task
-from torchgco.scenarios.stored_maps import MAP_ARRAYS, map_arrays
+from torchgco.scenarios.layouts import MAP_ARRAYS, map_arrays
 
 COMMAND = "torchgco-dataset"
 LeftOut = Literal["X", "K", "multipliers"]

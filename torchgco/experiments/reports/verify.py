@@ -35,8 +35,8 @@ from torchgco.experiments.results.folder import (
 from torchgco.experiments.results.identity import closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
 from torchgco.experiments.results.limits import read_table
+from torchgco.experiments.results.merge import values_of
 from torchgco.experiments.results.runs import below
-from torchgco.experiments.results.variants import values_of
 from torchgco.experiments.statistics.statistics import swept_columns
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.fleets.drawn import solution_of
