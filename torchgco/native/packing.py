@@ -1,4 +1,4 @@
-"""A problem in the structures that the library reads: cost, constraints, guide, and the numbers that a form shares.
+"""A problem in the structures that the library reads: cost, constraints, guide, and the numbers of its form."""
 
 from __future__ import annotations
 
