@@ -25,8 +25,8 @@ from benchmarks.lib.recorded import solve
 from torchgco import Problem, Solution, presets
 from torchgco.plotting.style import INK, PALETTE, save, tidy
 from torchgco.roadmap.cheapest import GraphSearch, library_for
+from torchgco.roadmap.geometry import scene_of
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, MARGIN, NEIGHBOURS, NODES, Roadmap, halton
-from torchgco.roadmap.scene import scene_of
 from torchgco.scenarios import Layouts
 from torchgco.solution import Fate
 

@@ -12,15 +12,15 @@ import torch
 import torchgco
 from tests.other_device import OTHER, SecondDevice
 from torchgco import ControlBounds, DeviceWarning, FunctionConstraint, Goal, Planar, Problem, QuadraticCost, Spheres
-from torchgco.kernels import elsewhere, use_native
+from torchgco.kernels import choice, use_native
 
 DOUBLE: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
-PLACES = {"kernels/elsewhere.py"}  # of the copies there and back
+PLACES = {"kernels/choice.py"}  # of the copies there and back
 
 
 @pytest.fixture(autouse=True)
 def unsaid(monkeypatch) -> Iterator[None]:
-    monkeypatch.setattr(elsewhere, "_said", False)
+    monkeypatch.setattr(choice, "_said", False)
     yield
     use_native(True)
 
@@ -64,7 +64,7 @@ def test_the_bits_are_those_of_the_cpu(solver: str, whole: bool) -> None:
 
 def test_single_precision_is_solved_in_double() -> None:
     problem, U0 = problem_of("cpu", dtype=torch.float32)
-    expected = torchgco.solve(elsewhere._copied(problem), U0.double(), "interior_point")
+    expected = torchgco.solve(choice._copied(problem), U0.double(), "interior_point")
     with SecondDevice(), pytest.warns(DeviceWarning):
         solution = torchgco.solve(*problem_of(OTHER, dtype=torch.float32), "interior_point")
         assert solution.X.dtype == torch.float32 and solution.X.tolist() == expected.X.float().tolist()
@@ -75,7 +75,7 @@ def test_code_that_holds_a_tensor_of_the_device_stays_there() -> None:
         warnings.simplefilter("error", DeviceWarning)
         most = torch.tensor([2.0], dtype=torch.float64, device=OTHER)
         problem, U0 = problem_of(OTHER, FunctionConstraint(lambda x: x[..., 3:4] - most))
-        assert elsewhere.on_cpu(problem) is None
+        assert choice.on_cpu(problem) is None
         solution = torchgco.solve(problem, U0, torchgco.AugmentedLagrangian(max_outer_iterations=1), verbose=False)
         assert solution.account is not None and solution.account.kernels == "pytorch" and solution.X.device == OTHER
 
@@ -83,4 +83,4 @@ def test_code_that_holds_a_tensor_of_the_device_stays_there() -> None:
 def test_chosen_kernels_stay_there() -> None:
     use_native(False)
     with SecondDevice():
-        assert elsewhere.on_cpu(problem_of(OTHER)[0]) is None
+        assert choice.on_cpu(problem_of(OTHER)[0]) is None

@@ -44,8 +44,8 @@ from torchgco.kernels import use_native
 from torchgco.maps import Field, OccupancyGrid
 from torchgco.maps.distance import DistanceField
 from torchgco.missions import RotorPlant
+from torchgco.roadmap.geometry import scene_of
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
 from torchgco.search.reach import limit_of
 
 N, R = 3, 0.06

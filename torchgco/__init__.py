@@ -70,7 +70,7 @@ from torchgco.guesses import Guess
 from torchgco.guidance import GCO, MPPI
 from torchgco.judging.certificate import Certificate
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
-from torchgco.missions.constraints import FirstStepRates
+from torchgco.missions.planning_problem import FirstStepRates
 from torchgco.obstacles import Body, Boxes, Capsules, Ellipsoids, Moved, OscillatingBoxes, Spheres
 from torchgco.phases import Jump, Phases, PhasesSolution
 from torchgco.phases.judging import certify, judge

@@ -26,7 +26,7 @@ from torchgco.judging.judge import judge, judged_columns
 from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.phases import Phases, PhasesSolution
-from torchgco.phases.solve import solve_phases
+from torchgco.phases.solution import solve_phases
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import guessing_times

@@ -14,7 +14,7 @@ from torchgco.base import clock
 from torchgco.base.errors import HorizonWarning, InputError, shown
 from torchgco.base.shapes import check_shape, tensor
 from torchgco.base.tree import PerElement, put, take
-from torchgco.explaining.account import Account
+from torchgco.explaining.explain import Account
 from torchgco.explaining.record import GuessRecord
 from torchgco.lagrangian.quality import is_preferred
 from torchgco.obstacles.base import ADMITTED

@@ -13,16 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchgco.base.differentiability import Differentiability
 from torchgco.base.errors import InputError, shown
 from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.gradients import without_gradients
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, check_device, check_shape
-from torchgco.base.status import Status
+from torchgco.base.status import Differentiability, Status
 from torchgco.base.tree import moved, take
-from torchgco.explaining.account import Account
-from torchgco.explaining.explain import Explanation, explanation
+from torchgco.explaining.explain import Account, Explanation, explanation
 from torchgco.explaining.record import Comparison as Comparison
 from torchgco.explaining.record import Fate as Fate
 from torchgco.explaining.record import GuessRecord as GuessRecord
@@ -31,8 +29,7 @@ from torchgco.explaining.record import Standing as Standing
 from torchgco.judging.judge import columns as judged
 from torchgco.judging.worst import worst_rows
 from torchgco.lagrangian.lagrangian import Multipliers, shifted
-from torchgco.problem.sampled import sampled
-from torchgco.problem.times import times
+from torchgco.problem.times import sampled, times
 
 if TYPE_CHECKING:
     import pandas as pd

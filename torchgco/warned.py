@@ -9,9 +9,8 @@ from torch import Tensor
 
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, ScaleWarning, StepWarning
 from torchgco.base.status import Status
-from torchgco.judging.scale import SHARE, dwarfed, noise
 from torchgco.judging.steps import Costates, step_errors
-from torchgco.judging.worst import NO_PLACE, kind_of
+from torchgco.judging.worst import NO_PLACE, SHARE, dwarfed, kind_of, noise
 from torchgco.kernels import costates
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.problem.in_time import at_times

@@ -29,7 +29,7 @@ from torchgco import compose, judge, presets
 from torchgco.judging.judge import near_best
 from torchgco.plotting.bodies import Box, bodies
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import has_paths
+from torchgco.roadmap.geometry import has_paths
 from torchgco.scenarios import Layouts
 from torchgco.search import PathProposals, Refine
 from torchgco.search.proposals import Round

@@ -18,7 +18,7 @@ import torchgco
 from benchmarks.families.general_problems import FAMILIES, SETS
 from benchmarks.lib.page import filed, markdown
 from torchgco import ControlBounds, InteriorPoint, Problem, QuadraticCost, Solution, StateBounds
-from torchgco.base.differentiability import Differentiability
+from torchgco.base.status import Differentiability
 from torchgco.problem.problem import current_problem
 from torchgco.sensitivity.attach import for_systems
 from torchgco.sensitivity.points import points_of

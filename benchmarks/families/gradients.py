@@ -34,7 +34,7 @@ from torchgco import (
     Solution,
     Spheres,
 )
-from torchgco.base.differentiability import Differentiability
+from torchgco.base.status import Differentiability
 from torchgco.experiments.config.build import compose
 
 D = torch.float64

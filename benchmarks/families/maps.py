@@ -30,7 +30,7 @@ from benchmarks.lib.rasters import rasterised
 from torchgco import Field, Problem, Roadmap
 from torchgco.maps import DistanceField
 from torchgco.obstacles.base import Obstacles
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import scene_of
 from torchgco.scenarios import Task
 
 SCALES = {"planar_random": 0.1}  # a world of 2 m with discs of 8 cm has cells a tenth as large

@@ -20,7 +20,7 @@ from benchmarks.lib.command import parser_of
 from benchmarks.lib.families import EVERY, FAMILIES, Family
 from benchmarks.lib.page import chosen, crossed, filed, interval, machine, markdown, origin, put, share, shown
 from benchmarks.lib.studies import flown
-from torchgco.experiments.results.success import with_success
+from torchgco.experiments.results.folder import with_success
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.scenarios import Layouts
 

@@ -17,9 +17,8 @@ from torch import Tensor
 from benchmarks.lib.families import WORLDS, Family
 from torchgco import compose, judge
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.roadmap.geometry import length
+from torchgco.roadmap.geometry import length, scene_of
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
 from torchgco.scenarios import Layouts, Task, concatenate
 from torchgco.solvers.contracts import Solver
 

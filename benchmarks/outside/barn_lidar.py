@@ -49,8 +49,7 @@ from torchgco import (
     Solution,
     StateBounds,
 )
-from torchgco.exploration.sensing.sensors import Lidar
-from torchgco.exploration.sensing.world import Motion, World
+from torchgco.exploration.sensing.sensors import Lidar, Motion, World
 
 STAGES = 100  # of a plan
 LIMIT = 100.0  # s, after which the challenge ends a run

@@ -16,9 +16,8 @@ from torchgco import compose
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.missions.contact import Contact
 from torchgco.missions.mission import Mission
-from torchgco.missions.outcome import Ending
+from torchgco.missions.outcome import Ending, clearances, ending, mission_frame, mission_row, samples
 from torchgco.missions.planner import MissionPlan, Planner
-from torchgco.missions.tables import clearances, ending, mission_frame, mission_row, samples
 from torchgco.missions.tracker import Tracker, Tracking
 from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course

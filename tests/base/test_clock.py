@@ -15,7 +15,7 @@ from torchgco.experiments.flying.progress import NoBar
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.kernels import choice
 from torchgco.native import compiler
-from torchgco.roadmap import library
+from torchgco.roadmap import native_maps
 
 HOUR = 3600.0
 
@@ -34,7 +34,7 @@ def loads(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     monkeypatch.setattr(compiler, "_load", slow)
     monkeypatch.setattr(compiler, "_loaded", {})
     monkeypatch.setattr(choice, "_engines", {})
-    library._library.cache_clear()
+    native_maps._library.cache_clear()
     return found
 
 

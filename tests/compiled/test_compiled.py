@@ -35,7 +35,7 @@ from torchgco import (
     Unicycle,
 )
 from torchgco.kernels import use_native
-from torchgco.native import kept
+from torchgco.native import interior
 from torchgco.native.compiler import find_compiler
 
 pytestmark = [
@@ -158,7 +158,7 @@ def test_written_numbers_lie_in_memory_as_bound_ones_do(kind: str) -> None:
 def memory(mpc: torchgco.Compiled) -> list[Tensor]:
     """All numbers that C reads."""
     packed = mpc._kept
-    assert isinstance(packed, kept.Kept)
+    assert isinstance(packed, interior.Kept)
     arrays = [packed._model, *packed._cost]
     arrays += [value for numbers in packed._numbers for value in numbers.values() if hasattr(value, "size")]
     return [tensor for array in arrays for tensor in getattr(array, "kept", [])] + [packed.X[:, 0]]

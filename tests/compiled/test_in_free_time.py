@@ -28,8 +28,7 @@ from torchgco import (
 from torchgco.kernels import choice
 from torchgco.native import compiler
 from torchgco.native.compiler import find_compiler
-from torchgco.problem.elapsed import Elapsed
-from torchgco.problem.in_time import times_of
+from torchgco.problem.in_time import Elapsed, times_of
 from torchgco.tracing import Facts
 
 pytestmark = [

@@ -30,7 +30,7 @@ from torchgco import (
 from torchgco.base.errors import InputError
 from torchgco.constraints.between_knots import _answered
 from torchgco.native.compiler import find_compiler
-from torchgco.problem.between import between
+from torchgco.problem.times import between
 
 compiled = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 POINT = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.35, "rk4", position=slice(0, 2))

@@ -29,7 +29,7 @@ from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.gates import passes
 from torchgco.kernels import measured
-from torchgco.roadmap.legs import timed
+from torchgco.roadmap.roadmap import timed
 from torchgco.search import Follow
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call

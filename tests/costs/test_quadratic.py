@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchgco import Cost, FunctionDynamics, InputError, Problem, QuadraticCost
-from torchgco.lagrangian.expansion import quadratise
+from torchgco.lagrangian.lagrangian import quadratise
 
 n, m, N, B = 3, 2, 4, 3
 

@@ -20,7 +20,7 @@ from torchgco import (
     Unicycle,
 )
 from torchgco.dynamics import PointMass
-from torchgco.lagrangian.expansion import linearise
+from torchgco.lagrangian.lagrangian import linearise
 
 MODELS = [Planar, QuadrotorPlanning, QuadrotorPlant, RotorTracking, Unicycle, Bicycle, PointMass]
 FIELDS = {

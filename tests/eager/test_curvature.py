@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchgco.eager.curvature import by_forward, by_reverse, expansion_of, flat
+from torchgco.eager.functions import by_forward, by_reverse, expansion_of, flat
 
 D = torch.float64
 

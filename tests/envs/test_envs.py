@@ -22,7 +22,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from torchgco.envs import MissionEnv, MissionVectorEnv, PlannerPolicy  # noqa: E402
-from torchgco.envs.observation import rotation, surroundings  # noqa: E402
+from torchgco.envs.episodes import rotation, surroundings  # noqa: E402
 
 REST = np.array([0.0, 0.0, 0.0, 9.81], np.float32)
 

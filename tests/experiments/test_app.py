@@ -19,7 +19,7 @@ from tests.experiments.commands import ENVIRONMENT, ROOT, TINY, command, problem
 from torchgco import kernels
 from torchgco.experiments.config.build import compose, compose_config
 from torchgco.experiments.config.groups import options_of
-from torchgco.experiments.flying import progress, together
+from torchgco.experiments.flying import progress
 from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive, digest
 from torchgco.scenarios import Layouts
@@ -71,7 +71,7 @@ def test_a_study_writes_all_its_files(run, tmp_path) -> None:
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("without_report")
 def test_the_bar_counts_the_solved_problems(workers: int, run, monkeypatch) -> None:
-    monkeypatch.setattr(together, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr(workers, "tqdm", partial(tqdm, mininterval=0))
     monkeypatch.setattr(progress, "watched", lambda: True)
     words = ["solver=al_ilqr", "study.baselines=[]", *TINY[:4], f"study.workers={workers}", "hydra.run.dir=out"]
     code, _, err = run(*words)

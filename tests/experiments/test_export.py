@@ -13,7 +13,7 @@ from tests.experiments.commands import HOLD
 from tests.experiments.test_view import MISSION
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports import bags, export
-from torchgco.missions.tables import STATES
+from torchgco.missions.outcome import STATES
 
 
 def test_single_trajectories(run, tmp_path, capsys) -> None:

@@ -17,8 +17,8 @@ from tqdm import tqdm
 from tests.experiments.commands import problem_line
 from tests.trials import missions
 from tests.trials import trials as hand_made
-from torchgco.experiments.flying import progress, together
-from torchgco.experiments.reports import mission_report, report
+from torchgco.experiments.flying import progress, workers
+from torchgco.experiments.reports import report
 from torchgco.experiments.reports.verify import verify
 from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.missions import RotorPlant
@@ -37,7 +37,7 @@ def trials(folder: Path) -> pd.DataFrame:
 
 
 def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(together, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr(workers, "tqdm", partial(tqdm, mininterval=0))
     monkeypatch.setattr(progress, "watched", lambda: True)
     code, out, err = run("experiment=mission", *SHORT)
     assert code == 0 and "forest 0, gco: TIMEOUT after 0.20 s" in out
@@ -59,7 +59,7 @@ def test_one_mission_writes_log_figures_and_animation(run, tmp_path, monkeypatch
 @pytest.fixture
 def few_figures(monkeypatch) -> None:
     """No animation, and empty figures of what has no place: the first test draws them all, for most of its time."""
-    monkeypatch.setattr(mission_report, "mission_animation", lambda *_: None)
+    monkeypatch.setattr(report, "mission_animation", lambda *_: None)
     for name in ("compute", "commands", "states", "tracking"):
         monkeypatch.setattr(draw, f"{name}_figure", lambda *_: Figure())
 

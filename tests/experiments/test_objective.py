@@ -15,8 +15,7 @@ from tests.trials import flights, missions, trials
 from torchgco import InputError
 from torchgco.experiments.flying.jobs import Jobs, Report, Scored
 from torchgco.experiments.reports.report import main
-from torchgco.experiments.results.kinds import parts_of
-from torchgco.experiments.results.objective import OF_MISSIONS, OF_TRAJECTORIES, objective_of
+from torchgco.experiments.results.kinds import OF_MISSIONS, OF_TRAJECTORIES, objective_of, parts_of
 from torchgco.experiments.statistics.power import layouts_needed, power
 
 WORDS = ["scenario=forest", *HOLD[1:], "solver=hold", "study.figures=false"]

@@ -11,7 +11,7 @@ import pytest
 from tests.experiments.commands import HOLD
 from tests.view.test_packing import part
 from torchgco import InputError
-from torchgco.experiments.reports import mission_view, view
+from torchgco.experiments.reports import finished, view
 from torchgco.native.compiler import NativeError
 
 WORDS = [*HOLD, "study.figures=false", "study.view=true", "study.figure=one"]
@@ -86,7 +86,7 @@ def test_missions_with_a_sensor_show_what_was_seen(run, tmp_path, capsys, monkey
 
     for target, words in (("replayed", "no map: no C compiler found"), ("Study.mission", "no map: ")):
         with monkeypatch.context() as patch:
-            patch.setattr(f"{mission_view.__name__}.{target}", refused if target == "replayed" else old)
+            patch.setattr(f"{finished.__name__}.{target}", refused if target == "replayed" else old)
             assert view.main([str(tmp_path / "unknown"), "--output", str(tmp_path / "less.html")]) == 0
         (note,) = part((tmp_path / "less.html").read_text(), "head")["notes"]
         (flight,) = part((tmp_path / "less.html").read_text(), "part-0")["flights"]

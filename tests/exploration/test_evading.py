@@ -7,7 +7,7 @@ import numpy as np
 from torchgco.exploration.evading import evaded, offsets
 from torchgco.exploration.movers import Known, Moving
 from torchgco.exploration.sensing import World
-from torchgco.exploration.sensing.world import Motion
+from torchgco.exploration.sensing.sensors import Motion
 
 DT, KEEP, HOLD = 0.05, 0.3, 1.0
 LINE = np.column_stack([4.0 * DT * np.arange(61), np.zeros(61), np.full(61, 2.0)])  # 4 m/s for 3 s

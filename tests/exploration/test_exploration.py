@@ -20,9 +20,8 @@ from torchgco.exploration.sensing import Depth, Lidar
 from torchgco.missions import Planner
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
-from torchgco.missions.outcome import Outcome
+from torchgco.missions.outcome import SENSED, Outcome, ending, mission_frame, mission_row, packed, unpacked
 from torchgco.missions.plant import RotorPlant, hovering
-from torchgco.missions.tables import SENSED, ending, mission_frame, mission_row, packed, unpacked
 
 GOALS = torch.tensor([[4.0, 0.0, 0.0], [3.0, 0.5, 0.2]]).double()
 EXPLORER = Explorer(around=(2.5, 1.5), stages=40)

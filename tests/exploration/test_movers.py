@@ -10,7 +10,7 @@ from torchgco import Goal, Problem, Spheres, compose
 from torchgco.exploration.movers import Known, Moving, Tracks, clusters, seen_ball
 from torchgco.exploration.sensing import Lidar, SeenMap, World
 from torchgco.exploration.sensing.grid import OCCUPIED
-from torchgco.exploration.sensing.world import Motion
+from torchgco.exploration.sensing.sensors import Motion
 
 
 def ball(center: list[float], radius: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 
 from tests.exploration.test_exploration import GOALS, mission, walled
 from torchgco import InputError
-from torchgco.exploration.replay import replayed
+from torchgco.exploration.mission import replayed
 from torchgco.exploration.safety import safe_periods
 from torchgco.missions import Disturbance
 

@@ -33,8 +33,7 @@ from torchgco import (
     kernels,
     presets,
 )
-from torchgco.guidance.gco import R_GUIDE, _radius
-from torchgco.guidance.suitability import TRIAL_SAMPLES, suited_sampler
+from torchgco.guidance.gco import R_GUIDE, TRIAL_SAMPLES, _radius, suited_sampler
 from torchgco.native.compiler import find_compiler
 from torchgco.search import Follow, PathProposals
 

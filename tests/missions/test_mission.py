@@ -15,11 +15,10 @@ from torchgco.missions.contact import Contact
 from torchgco.missions.disturbance import Disturbance
 from torchgco.missions.log import MissionLog
 from torchgco.missions.mission import Mission
-from torchgco.missions.outcome import Ending, Outcome
+from torchgco.missions.outcome import Ending, Outcome, ending
 from torchgco.missions.planner import Planner
 from torchgco.missions.planning_problem import planning_state
 from torchgco.missions.plant import RotorPlant, hovering
-from torchgco.missions.tables import ending
 from torchgco.missions.tracker import Reference, Tracker
 
 TIMES = ("planner_seconds", "tracker_seconds")

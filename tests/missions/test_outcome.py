@@ -12,8 +12,17 @@ from tests.missions.test_mission import NAMES, RADII, ends, six
 from torchgco import Airframe, Problem, QuadraticCost, QuadrotorPlanning, Spheres
 from torchgco.missions.contact import Contact
 from torchgco.missions.log import MissionLog
-from torchgco.missions.outcome import Ending, Outcome, judge_flight
-from torchgco.missions.tables import ending, energy, mission_frame, mission_row, samples, time_step_frame
+from torchgco.missions.outcome import (
+    Ending,
+    Outcome,
+    ending,
+    energy,
+    judge_flight,
+    mission_frame,
+    mission_row,
+    samples,
+    time_step_frame,
+)
 
 PER_SEGMENT = 200  # points between two samples of the dense judge
 FRAME = Airframe()

@@ -14,9 +14,8 @@ import torch
 from torchgco import ControlBounds, Gates, InputError, NormBounds, Problem, Spheres, compose
 from torchgco.constraints.gates import GateBalls
 from torchgco.missions import Disturbance, Flight, Outcome, RaceMission, RacePlanner, endings
-from torchgco.missions.contact import Contact
+from torchgco.missions.contact import Contact, Passing
 from torchgco.missions.outcome import judge_flight
-from torchgco.missions.passing import Passing
 from torchgco.missions.race import Racer
 from torchgco.presets import interior_point
 

@@ -18,8 +18,7 @@ from tests.missions.test_plants import random_states
 from torchgco import Airframe, InputError
 from torchgco.missions import RotorPlant
 from torchgco.missions.simulators.crazyflow import CrazyflowPlant
-from torchgco.missions.simulators.mjcf import ROTOR_CORNERS, files_named, mjcf
-from torchgco.missions.simulators.mujoco import MujocoPlant
+from torchgco.missions.simulators.mujoco import ROTOR_CORNERS, MujocoPlant, files_named, mjcf
 from torchgco.missions.simulators.rotorpy import RotorpyPlant, parameters_of
 
 OWN = Airframe(mass=1.2, arm=0.15, thrust_max=4.5, drag=0.2, rotor_time_constant=0.07)

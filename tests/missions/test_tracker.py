@@ -13,7 +13,7 @@ from tests.reference import models, tracking
 from torchgco import Airframe, InputError, Problem, compose
 from torchgco.costs import QuadraticCost
 from torchgco.dynamics.quadrotor import RotorTracking
-from torchgco.missions.constraints import RotorLimits
+from torchgco.missions.planning_problem import RotorLimits
 from torchgco.missions.plant import RotorPlant, hovering
 from torchgco.missions.tracker import Reference, Tracker, Tracking
 

@@ -11,8 +11,8 @@ from tests.problems import boxed_batch, planar_batch
 from torchgco import MPPI, Problem
 from torchgco.base.draws import DrawKey
 from torchgco.kernels import EagerWarning, cost_unit, kernels_of
+from torchgco.roadmap.geometry import scene_of
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
 from torchgco.solvers.ending import optimality
 
 SAMPLER = MPPI(samples=19, covariance=0.5, rounds=2, noise_knots=3, elite=4, dwell_cost=0.5)

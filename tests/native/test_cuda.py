@@ -28,7 +28,7 @@ from tests.other_device import OTHER, SecondDevice
 from tests.slow import mostly
 from tests.test_elsewhere import numbers, problem_of
 from torchgco import DeviceWarning, Problem
-from torchgco.kernels import elsewhere
+from torchgco.kernels import choice
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.cuda import compiler, launch
 from torchgco.native.cuda.engine import OnDevice, working_on
@@ -112,7 +112,7 @@ def test_a_problem_of_a_device_is_served_there(monkeypatch) -> None:
     problem, U0 = problem_of("cpu")
     expected, shims = torchgco.solve(problem, U0, "interior_point", verbose=False), Shims()
     served = OnDevice(shims, 1)
-    monkeypatch.setattr(elsewhere, "on_device", lambda device: served if device.type == OTHER.type else None)
+    monkeypatch.setattr(choice, "on_device", lambda device: served if device.type == OTHER.type else None)
     with SecondDevice():
         solution = torchgco.solve(*problem_of(OTHER), "interior_point", verbose=False)
         assert solution.X.device == OTHER and numbers(solution) == numbers(expected)
@@ -126,7 +126,7 @@ def test_commands_of_a_device_are_sampled_there(monkeypatch) -> None:
     states = [problem_of("cpu")[0].x0 + 0.01 * i for i in range(2)]
     expected = [controller.command(x).tolist() for x in states]
     served = OnDevice(shims, 1)
-    monkeypatch.setattr(elsewhere, "on_device", lambda device: served if device.type == OTHER.type else None)
+    monkeypatch.setattr(choice, "on_device", lambda device: served if device.type == OTHER.type else None)
     with SecondDevice():
         controller = torchgco.MPPIController(problem_of(OTHER)[0], sampler)
         controls = [controller.command(x.to(OTHER)) for x in states]
@@ -138,7 +138,7 @@ def test_compiled_problems_of_a_device_are_solved_there(monkeypatch) -> None:
     """By calls and by a control loop; their answers lie on the CPU."""
     found, shims = [], Shims()
     served = OnDevice(shims, 1)
-    monkeypatch.setattr(elsewhere, "on_device", lambda device: served if device.type == OTHER.type else None)
+    monkeypatch.setattr(choice, "on_device", lambda device: served if device.type == OTHER.type else None)
     for device in ("cpu", OTHER):
         with SecondDevice():
             problem, _ = problem_of(device)
@@ -154,9 +154,9 @@ def test_compiled_problems_of_a_device_are_solved_there(monkeypatch) -> None:
 
 
 def test_without_a_device_there_are_no_kernels() -> None:
-    assert elsewhere.on_device(torch.device("cpu")) is None
+    assert choice.on_device(torch.device("cpu")) is None
     if not torch.cuda.is_available():
-        assert not compiler.available() and elsewhere.on_device(torch.device("cuda")) is None
+        assert not compiler.available() and choice.on_device(torch.device("cuda")) is None
 
 
 def test_few_problems_are_solved_by_the_cpu() -> None:

@@ -24,12 +24,11 @@ from torchgco.base.draws import DrawKey
 from torchgco.base.status import Status
 from torchgco.exploration.sensing.library import C_FOLDER as SENSING
 from torchgco.guidance import mppi
-from torchgco.ilqr import descent, lifted
-from torchgco.ilqr.lifted import lifted_search
-from torchgco.ilqr.step import iterate
+from torchgco.ilqr import step as iteration
+from torchgco.ilqr.step import iterate, lifted_search
 from torchgco.kernels import kernels_of
 from torchgco.kernels.in_c import native_options
-from torchgco.lagrangian.state import State
+from torchgco.lagrangian.lagrangian import State
 from torchgco.native import structures
 from torchgco.native.codegen.source import INTERIOR, LANES, SAMPLER, SOLVER_LIBRARY
 from torchgco.native.compiler import NativeError, build, find_compiler
@@ -38,8 +37,8 @@ from torchgco.native.includes import C, included, joined
 from torchgco.native.structures import CONSTANTS, End, Options
 from torchgco.roadmap import cheapest as roadmap
 from torchgco.roadmap import native_maps
+from torchgco.roadmap.geometry import scene_of
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 
@@ -222,7 +221,7 @@ OF_LINE_SEARCH = {
 def test_a_constant_of_ilqr_changes_both_kernels(name: str, monkeypatch) -> None:
     value, inner, prepare, problem, count = OF_ILQR[name]
     usual = run(inner, prepare, problem(), True, count)
-    monkeypatch.setattr(descent, name, value)
+    monkeypatch.setattr(iteration, name, value)
     mine, theirs = (run(inner, prepare, problem(), native, count) for native in (True, False))
     assert not same(mine, usual) and same(mine, theirs)
 
@@ -246,7 +245,7 @@ def test_iterates_are_lost_where_python_says(B: int, monkeypatch) -> None:
     """With LOST_BY = 0 every refused iterate counts as lost, and a lifted search follows, in both kernels."""
     problem = planar().take(torch.arange(B))
     usual = run(CHOOSY, unchanged, problem, True, 1)
-    monkeypatch.setattr(lifted, "LOST_BY", 0.0)
+    monkeypatch.setattr(iteration, "LOST_BY", 0.0)
     mine, theirs = (run(CHOOSY, unchanged, problem, native, 1) for native in (True, False))
     assert not same(mine, usual) and same(mine, theirs)
 
@@ -256,7 +255,7 @@ def test_a_constant_of_the_lifted_search_changes_both_kernels(name: str, value: 
     state, lagrangian = running_state(planar())
     searches = (kernels_of(lagrangian.problem).lifted, lifted_search)
     usual = [search(lagrangian, state.X, state.U, state.merit).accepted for search in searches]
-    monkeypatch.setattr(lifted, name, value)
+    monkeypatch.setattr(iteration, name, value)
     changed = [search(lagrangian, state.X, state.U, state.merit).accepted for search in searches]
     assert bool(usual[0].any()) and torch.equal(*usual)
     assert not bool(changed[0].all()) and torch.equal(*changed) and not torch.equal(usual[0], changed[0])
@@ -269,10 +268,11 @@ def test_every_option_reaches_the_library() -> None:
     want = {
         "rungs": len(search.ladder(False)), "back": 2, "max_iterations": 13, "accept_last": 0, "tolerance": 0.011,
         "absolute_tolerance": 0.0, "ratio_min": search.ratio_min, "ratio_max": search.ratio_max,
-        "smallest": search.smallest, "rounding": descent.ROUNDED_OFF, "lost": lifted.LOST_BY,
-        "regularisation_first": descent.REGULARISATION_FIRST, "regularisation_growth": descent.REGULARISATION_GROWTH,
-        "regularisation_max": descent.REGULARISATION_MAX, "damping": descent.DAMPING,
-        "damping_growth": descent.DAMPING_GROWTH, "damping_decay": descent.DAMPING_DECAY,
+        "smallest": search.smallest, "rounding": iteration.ROUNDED_OFF, "lost": iteration.LOST_BY,
+        "regularisation_first": iteration.REGULARISATION_FIRST,
+        "regularisation_growth": iteration.REGULARISATION_GROWTH,
+        "regularisation_max": iteration.REGULARISATION_MAX, "damping": iteration.DAMPING,
+        "damping_growth": iteration.DAMPING_GROWTH, "damping_decay": iteration.DAMPING_DECAY,
     }  # fmt: skip
     assert {name: getattr(options, name) for name in Options.declared if name != "ladder"} == want
     ladder = (ctypes.c_double * options.rungs).from_address(options.ladder)

@@ -30,14 +30,12 @@ from torchgco import (
     kernels,
 )
 from torchgco.dynamics.rollout import open_loop
-from torchgco.ilqr import descent
+from torchgco.ilqr import step as iteration
 from torchgco.ilqr.riccati import backward
 from torchgco.ilqr.step import iterate
 from torchgco.kernels import EagerWarning, kernels_of
-from torchgco.lagrangian.expansion import linearise
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, PassEnd, State, linearise
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion
-from torchgco.lagrangian.state import PassEnd, State
 from torchgco.solvers import ilqr
 from torchgco.solvers.ending import optimality
 
@@ -301,8 +299,8 @@ def test_statuses_are_those_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
     free = planar_batch(B=2, N=6)[0]
     concave = replace(free.cost, R=-free.cost.R)
     problem = free._with({"cost": concave, "constraints": ()})
-    for inner, limit in ((DAMPED, 1e-4), (replace(DAMPED, max_iterations=3), descent.REGULARISATION_MAX)):
-        monkeypatch.setattr(descent, "REGULARISATION_MAX", limit)
+    for inner, limit in ((DAMPED, 1e-4), (replace(DAMPED, max_iterations=3), iteration.REGULARISATION_MAX)):
+        monkeypatch.setattr(iteration, "REGULARISATION_MAX", limit)
         (a, first), (b, second) = running_state(problem), running_state(problem)
         native = natively(inner, b, second, 3)
         statuses = torch.zeros(2, dtype=torch.int64)
@@ -365,8 +363,8 @@ def test_a_pivot_of_zero_is_a_failed_factorisation() -> None:
     assert bool(a.merit.isfinite().all())
     end = iterate(DAMPED.descent, a, first)
     native = natively(DAMPED, b, second, 1)
-    assert bool(end.failed.all()) and a.regularisation.tolist() == [descent.REGULARISATION_FIRST] * 3
-    assert native.used.tolist() == [descent.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())
+    assert bool(end.failed.all()) and a.regularisation.tolist() == [iteration.REGULARISATION_FIRST] * 3
+    assert native.used.tolist() == [iteration.REGULARISATION_FIRST] * 3 and not bool(native.stuck.any())
     assert in_c(problem).judged(second, b.X, b.U).step.failed.all()
 
 
@@ -376,6 +374,6 @@ def test_a_small_change_under_damping_is_no_convergence(times: float, converges:
     problem, loose = planar_batch(B=3, N=8)[0], ILQR(tolerance=1e3)
     for native in (True, False):
         state, lagrangian = running_state(problem)
-        state.regularisation = torch.full_like(state.merit, times * descent.DAMPING)
+        state.regularisation = torch.full_like(state.merit, times * iteration.DAMPING)
         end = natively(loose, state, lagrangian, 1) if native else iterate(loose.descent, state, lagrangian)
         assert end.converged.tolist() == [converges] * 3

@@ -15,9 +15,8 @@ from tests.slow import mostly
 from torchgco import ILQR, AugmentedLagrangian, Boxes, Problem, Spheres, StateBounds, presets
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.kernels import chord_clearance, kernels_of, measured, open_loop
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, SolveEnd
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.engine import Engine
 from torchgco.native.packing import is_bounded
 from torchgco.obstacles.spheres import BoundSpheres

@@ -22,7 +22,7 @@ from tests.problems import planar_batch, quick_gco
 from tests.slow import mostly
 from torchgco import Problem, Status, kernels
 from torchgco.constraints.base import Constraint
-from torchgco.ilqr.lifted import lifted_search
+from torchgco.ilqr.step import lifted_search
 from torchgco.kernels import EagerWarning, cost_unit, kernels_of
 from torchgco.native.compiler import find_compiler
 

@@ -36,10 +36,10 @@ from torchgco.kernels import use_native
 from torchgco.maps import PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.silhouettes import balls_at, silhouettes
-from torchgco.plotting.world import world_of
+from torchgco.plotting.bodies import balls_at, silhouettes
+from torchgco.plotting.scene import world_of
 from torchgco.problem.horizons import for_solvers
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import scene_of
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
 

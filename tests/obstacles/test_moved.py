@@ -28,7 +28,7 @@ from torchgco import (
 from torchgco.kernels import kernels_of
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.obstacles.moved import MovedBoxes, MovedSpheres
-from torchgco.problem.between import bulge
+from torchgco.problem.times import bulge
 
 D, DT = torch.float64, 0.1
 

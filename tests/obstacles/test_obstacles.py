@@ -16,7 +16,7 @@ from torchgco.base.shapes import Dimensions
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles import CONTACT_FACTOR, Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import scene_of
 
 
 @dataclass(frozen=True)

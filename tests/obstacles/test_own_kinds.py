@@ -14,14 +14,14 @@ from torch import Tensor
 import torchgco
 from torchgco import Body, Constraint, ControlBounds, FunctionDynamics, Goal, Problem, QuadraticCost, judge
 from torchgco.base.shapes import Dimensions
-from torchgco.compiled.numbered import with_own_numbers
+from torchgco.compiled.numbers import with_own_numbers
 from torchgco.obstacles import Obstacles
 from torchgco.obstacles.base import ABSENT, least
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.measured import along_ways
 from torchgco.obstacles.shapes import RoundedBoxes
-from torchgco.plotting.world import world_of
-from torchgco.roadmap.scene import scene_of
+from torchgco.plotting.scene import world_of
+from torchgco.roadmap.geometry import scene_of
 
 D = torch.float64
 BARS = 12  # around a ring, as the search and pictures see it

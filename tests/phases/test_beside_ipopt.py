@@ -14,7 +14,7 @@ from torchgco import FreeTime, FunctionConstraint, FunctionCost, FunctionDynamic
 from torchgco.base.errors import StepWarning
 from torchgco.judging.steps import step_errors
 from torchgco.kernels import costates
-from torchgco.phases.solve import _costates
+from torchgco.phases.solution import _costates
 
 pytestmark = compiled
 QUICK = "bouncing ball", "two-burn orbit raise"

@@ -17,9 +17,8 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.missions.outcome import Outcome
 from torchgco.plotting import missions
-from torchgco.plotting.bodies import Ball, Box
+from torchgco.plotting.bodies import Ball, Box, body_of
 from torchgco.plotting.course import Course
-from torchgco.plotting.silhouettes import body_of
 
 STEPS, KNOTS, PERIOD = 12, 6, 0.05
 

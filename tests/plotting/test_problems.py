@@ -23,8 +23,8 @@ from torchgco import Boxes, ControlBounds, Goal, InputError, Problem, Separation
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles import Obstacles
 from torchgco.plotting.problems import LIMIT
+from torchgco.plotting.scene import distances, world_of
 from torchgco.plotting.style import PALETTE
-from torchgco.plotting.world import distances, world_of
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ from tests.problems import planar_batch, quick_gco
 from torchgco import Cost, FunctionDynamics, Goal, InputError, Planar, Problem, Spheres, judge
 from torchgco.lagrangian.quality import goal_tolerance, has_arrived
 from torchgco.problem.goal import RADIUS_SHARE
-from torchgco.roadmap.scene import arrives, scene_of
+from torchgco.roadmap.geometry import arrives, scene_of
 
 CUP = [[0.0, -0.25], [0.1, 0.0], [0.12, 0.25], [0.0, 0.5], [-0.2, 0.6], [-0.2, -0.35]]
 

@@ -26,8 +26,7 @@ from torchgco import (
     presets,
 )
 from torchgco.costs.base import ShiftedCost
-from torchgco.judging.scale import dwarfed
-from torchgco.judging.worst import NO_PLACE
+from torchgco.judging.worst import NO_PLACE, dwarfed
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.solvers.ending import optimality
 

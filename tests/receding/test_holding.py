@@ -29,7 +29,7 @@ from torchgco import (
 )
 from torchgco.native.compiler import find_compiler
 from torchgco.problem.horizons import for_solvers
-from torchgco.receding.stopping import stopping
+from torchgco.receding.holding import stopping
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 N, DT, RADIUS = 30, 0.1, 0.5

@@ -10,9 +10,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from torchgco.maps.ways import neighbours
-from torchgco.roadmap.blocks import BENEATH_CONTACT, NODE_TIE, Blocks
 from torchgco.roadmap.clearances import Clearances
-from torchgco.roadmap.lattice import Array, Lattice
+from torchgco.roadmap.lattice import BENEATH_CONTACT, NODE_TIE, Array, Blocks, Lattice
 from torchgco.roadmap.native_maps import SURE_SPACINGS, WAY_PARTS
 
 

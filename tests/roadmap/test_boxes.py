@@ -31,9 +31,8 @@ from torchgco import (
 )
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.obstacles.boxes import BoundBoxes
-from torchgco.roadmap.geometry import Inflated, Scene
+from torchgco.roadmap.geometry import Inflated, Scene, scales, scene_of
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scales, scene_of
 
 
 def uneven(points: Tensor, rows: slice) -> Tensor:

@@ -15,7 +15,7 @@ from tests.slow import mostly
 from torchgco.base.tree import cast, take
 from torchgco.kernels import EagerWarning
 from torchgco.obstacles.base import Solids
-from torchgco.roadmap import cheapest, library
+from torchgco.roadmap import cheapest, native_maps
 from torchgco.roadmap.cheapest import HOPS, Graph, GraphSearch, library_for
 from torchgco.roadmap.geometry import Inflated, Scene
 from torchgco.roadmap.roadmap import Roadmap, halton
@@ -217,9 +217,9 @@ def test_without_a_library_there_is_no_path(monkeypatch: pytest.MonkeyPatch, tmp
         paths, found = Roadmap().paths(s, 2)
     assert not bool(found.any()) and torch.equal(paths[:, :, 1:], s.goal[:, None, None].expand(-1, 2, HOPS, -1))
     (tmp_path / "cheapest.c").write_text("not C code")
-    library._library.cache_clear()
+    native_maps._library.cache_clear()
     with monkeypatch.context() as patch, pytest.warns(EagerWarning, match=r"no \w+ are sought"):
-        patch.setattr(library, "C", tmp_path)
+        patch.setattr(native_maps, "C", tmp_path)
         assert not bool(Roadmap().paths(s)[1].any())
-    library._library.cache_clear()
+    native_maps._library.cache_clear()
     assert bool(Roadmap().paths(s)[1].all())

@@ -8,11 +8,10 @@ import torch
 from tests.roadmap.test_roadmap import random_scene
 from tests.roadmap.test_trunks import trunks
 from tests.slow import mostly
-from torchgco.roadmap import known as known_searches
+from torchgco.roadmap import roadmap as known_searches
 from torchgco.roadmap import roadmap as searches
 from torchgco.roadmap.geometry import Scene
-from torchgco.roadmap.known import Known
-from torchgco.roadmap.roadmap import Roadmap
+from torchgco.roadmap.roadmap import Known, Roadmap
 
 SOME = torch.tensor([0, 2, 3])
 

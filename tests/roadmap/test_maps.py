@@ -29,12 +29,10 @@ from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.maps.field import BoundField
 from torchgco.native.compiler import NativeError
 from torchgco.obstacles.base import Obstacles, Solids
-from torchgco.roadmap.blocks import blocks_of
-from torchgco.roadmap.geometry import Inflated, length
+from torchgco.roadmap.geometry import Inflated, has_paths, length, scene_of
 from torchgco.roadmap.homotopy import classes
-from torchgco.roadmap.lattice import lattice_of
+from torchgco.roadmap.lattice import blocks_of, lattice_of
 from torchgco.roadmap.mapped import Ways, _swept_on_the_way, keys, swept, tightened
-from torchgco.roadmap.scene import has_paths, scene_of
 from torchgco.roadmap.shortest import shortest_way
 from torchgco.solvers.contracts import Solver
 

@@ -13,9 +13,8 @@ from tests.search.scenes import NONE, inflated
 from tests.slow import mostly
 from torchgco import InputError, compose
 from torchgco.roadmap.cheapest import Graph, GraphSearch, library_for
-from torchgco.roadmap.geometry import Scene, points_along
+from torchgco.roadmap.geometry import Scene, points_along, scene_of
 from torchgco.roadmap.roadmap import HALTON_NEIGHBOURS, Roadmap, halton
-from torchgco.roadmap.scene import scene_of
 
 
 def flat(points, rows):

@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from torchgco import compose
-from torchgco.roadmap.geometry import Inflated, points_along
+from torchgco.roadmap.geometry import Inflated, points_along, scene_of
 from torchgco.roadmap.lattice import sampled
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
 
 
 @pytest.mark.slow

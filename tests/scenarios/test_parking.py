@@ -11,8 +11,8 @@ from matplotlib.collections import PolyCollection
 from tests.trials import flights, trials
 from torchgco import Bicycle, InputError, compose
 from torchgco.obstacles.body import BoundBody
+from torchgco.plotting.bodies import body_of
 from torchgco.plotting.layouts import layout_grid
-from torchgco.plotting.silhouettes import body_of
 from torchgco.problem.goal import GoalState
 from torchgco.scenarios import Layouts, Parking, concatenate
 from torchgco.search.poses import clear_at

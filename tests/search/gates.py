@@ -24,7 +24,7 @@ from torchgco import (
     QuadraticCost,
     Spheres,
 )
-from torchgco.lagrangian.state import SolveEnd
+from torchgco.lagrangian.lagrangian import SolveEnd
 from torchgco.search import Follow
 from torchgco.solvers.contracts import Call
 

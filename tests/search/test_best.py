@@ -12,8 +12,8 @@ from tests.search.gates import LOCAL, Solve
 from tests.search.rows import restarts
 from torchgco import GCO, ILQR, AugmentedLagrangian, Goal, LineSearch, Problem, QuadraticCost, Solution
 from torchgco.kernels.in_c import NativeKernels
-from torchgco.lagrangian.state import SolveEnd
-from torchgco.search.best import Best
+from torchgco.lagrangian.lagrangian import SolveEnd
+from torchgco.search.search import Best
 from torchgco.search.steps import ATTEMPT_SEED_STEP
 from torchgco.solvers.contracts import Advice, Call
 

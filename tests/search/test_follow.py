@@ -23,7 +23,7 @@ from torchgco.base.tree import take
 from torchgco.dynamics.rollout import open_loop
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.spheres import BoundSpheres
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import scene_of
 from torchgco.search.candidates import Candidates
 from torchgco.search.following import CORNER_DEPTH, Free, Paths, followed, travel, unconstrained
 from torchgco.search.nearby import without_obstacles

@@ -10,10 +10,10 @@ import torch
 from tests.problems import assert_same_bits, planar_batch, quick_gco
 from tests.slow import mostly
 from torchgco import Body, Boxes, InteriorPoint, Problem, Solution, Spheres, judge
-from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.lagrangian.lagrangian import Iterate, SolveEnd
 from torchgco.native.compiler import find_compiler
 from torchgco.search import nearby
-from torchgco.search.converge import continued
+from torchgco.search.chords import continued
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
 

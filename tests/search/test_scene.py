@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchgco import ControlBounds, Goal, Planar, Problem, QuadraticCost, Spheres
+from torchgco.roadmap.geometry import scales, scene_of
 from torchgco.roadmap.points import directions
-from torchgco.roadmap.scene import scales, scene_of
 
 
 def sized(radius: float) -> Problem:

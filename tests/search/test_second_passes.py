@@ -11,7 +11,7 @@ from tests.search.rows import proposed, varied, without
 from torchgco import ControlBounds, PathProposals, Problem, Restarts, Status, compose, presets
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.roadmap.scene import has_paths
+from torchgco.roadmap.geometry import has_paths
 from torchgco.search import Converge, Follow, Timed
 from torchgco.search.following import Paths, followed
 from torchgco.search.proposals import Part, Proposal, propose

@@ -30,8 +30,8 @@ from torchgco import (
     solve,
 )
 from torchgco.base.status import Status
-from torchgco.lagrangian.state import SolveEnd
-from torchgco.search.best import Best, is_sound
+from torchgco.lagrangian.lagrangian import SolveEnd
+from torchgco.search.search import Best, is_sound
 from torchgco.solvers.contracts import Call
 
 ROUNDING = 1e-8  # share of the cost

@@ -27,12 +27,11 @@ from torchgco import (
     solve,
 )
 from torchgco.base.errors import HorizonWarning
-from torchgco.dynamics.unicycle import Unicycle
+from torchgco.dynamics.planar import Unicycle
 from torchgco.kernels import path_clearance
-from torchgco.problem.between import bulge
+from torchgco.problem.times import bulge
 from torchgco.roadmap.timed import library_for
-from torchgco.search.timed_scenes import MOVES, STATES, can_search, scene_in_time
-from torchgco.search.velocity import Velocity
+from torchgco.search.timed_scenes import MOVES, STATES, Velocity, can_search, scene_in_time
 
 D, INF = torch.float64, float("inf")
 GCO = presets.gco(2)

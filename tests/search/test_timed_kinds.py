@@ -25,7 +25,7 @@ from torchgco import (
     presets,
     solve,
 )
-from torchgco.dynamics.unicycle import Unicycle
+from torchgco.dynamics.planar import Unicycle
 from torchgco.roadmap.timed import library_for
 from torchgco.search.timed_scenes import can_search
 

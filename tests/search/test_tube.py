@@ -24,15 +24,14 @@ from torchgco import (
     solve,
 )
 from torchgco.dynamics import Dynamics
+from torchgco.lagrangian.lagrangian import SolveEnd
 from torchgco.lagrangian.quality import has_arrived
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.maps import OccupancyGrid
 from torchgco.roadmap.clear import clear_path
-from torchgco.roadmap.geometry import length
+from torchgco.roadmap.geometry import length, scene_of
 from torchgco.roadmap.mapped import in_each
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
-from torchgco.search import Solve, Tube, pursue, solved_candidates, tube
+from torchgco.search import Solve, Tube, solved_candidates, tube
 from torchgco.search.following import Free, Paths
 
 D = torch.float64
@@ -86,7 +85,7 @@ def test_the_cheapest_that_is_feasible_and_arrives_is_kept(monkeypatch, model: D
     monkeypatch.setattr(solved_candidates, "solved_nearby", note)
     found = alone(problem, Tube("maps")).solve(problem, rest(problem))
     ((part, end),) = ends
-    assert 1 < part.B <= (tube.TOP if model is STEPS else pursue.SOLVED_WAYS)
+    assert 1 < part.B <= (tube.TOP if model is STEPS else tube.SOLVED_WAYS)
     good = [
         float(end.best.cost[i])
         for i in range(part.B)

@@ -13,7 +13,7 @@ import torchgco
 from tests.sensitivity.problems import asking, box_numbers, boxed, discs, numbers
 from tests.sensitivity.test_forms import FORMS
 from torchgco import ControlBounds, FunctionConstraint, FunctionDynamics, Goal, Problem, QuadraticCost, Spheres, Status
-from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.status import Differentiability as Why
 from torchgco.kernels import current
 from torchgco.sensitivity import attached
 from torchgco.sensitivity.points import Points, points_of

@@ -12,7 +12,7 @@ from torch import Tensor
 import torchgco
 from tests.engines import compiled
 from torchgco import ControlBounds, FunctionDynamics, Problem, QuadraticCost
-from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.status import Differentiability as Why
 from torchgco.kernels import current, use_native
 from torchgco.sensitivity import attached
 

@@ -13,7 +13,7 @@ from tests.engines import compiled
 from tests.sensitivity.problems import TIGHT, D, box_numbers, boxed, discs, growth, numbers, solved
 from tests.slow import mostly
 from torchgco import ControlBounds, FunctionDynamics, InputError, Problem, QuadraticCost, Solution, Spheres, Status
-from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.status import Differentiability as Why
 
 MOVED = "x0", "centers", "radii", "vehicle", "velocities", "Q", "R", "Qf", "x_ref", "upper", "drag", "bias", "budget"
 

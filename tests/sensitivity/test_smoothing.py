@@ -24,7 +24,7 @@ from torchgco import (
     Spheres,
     Status,
 )
-from torchgco.base.differentiability import Differentiability as Why
+from torchgco.base.status import Differentiability as Why
 from torchgco.kernels import use_native
 
 MU, STEP = 1e-3, 1e-4

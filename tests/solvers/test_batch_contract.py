@@ -20,7 +20,7 @@ from torchgco import (
 from torchgco.base.status import Status
 from torchgco.baselines import IteratedMPPI
 from torchgco.constraints import ControlBounds
-from torchgco.missions.constraints import FirstStepRates
+from torchgco.missions.planning_problem import FirstStepRates
 from torchgco.search import Follow, Refine
 from torchgco.solution import Solution
 

@@ -11,7 +11,8 @@ import torch
 from tests.problems import planar_batch
 from tests.solvers.problems import linear_problem, zeros
 from torchgco import ILQR, AugmentedLagrangian, Cost, FunctionConstraint, LineSearch, Problem, Solution, Status
-from torchgco.ilqr import descent, line_search
+from torchgco.ilqr import line_search
+from torchgco.ilqr import step as iteration
 from torchgco.ilqr.riccati import backward
 
 
@@ -98,7 +99,7 @@ def test_statuses(monkeypatch) -> None:
     walled = linear_problem(constraints=[impossible])
     cut = AugmentedLagrangian(max_outer_iterations=2)
     assert cut.solve(walled, zeros(walled)).statuses == [Status.MAX_ITERATIONS] * 2
-    monkeypatch.setattr(descent, "REGULARISATION_MAX", 1e-4)
+    monkeypatch.setattr(iteration, "REGULARISATION_MAX", 1e-4)
     hopeless = ILQR().solve(saddle(1.0), zeros(saddle(1.0)))
     assert hopeless.statuses == [Status.NOT_POSITIVE_DEFINITE] * 2
     assert all(status.sentence for status in Status)

@@ -26,8 +26,7 @@ from torchgco import (
 from torchgco.constraints.base import Constraint
 from torchgco.kernels import open_loop
 from torchgco.native.compiler import find_compiler
-from torchgco.solvers.infeasible import contradicts, left_to_close
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, contradicts, left_to_close
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 D, INF, N = torch.float64, torch.inf, 20

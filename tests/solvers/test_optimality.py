@@ -30,7 +30,7 @@ from torchgco import (
 from torchgco.baselines import Hold, IteratedMPPI
 from torchgco.costs.base import Cost
 from torchgco.lagrangian.lagrangian import Lagrangian
-from torchgco.search.suitability import suited_paths
+from torchgco.search.restarts import suited_paths
 from torchgco.solvers.ending import STATIONARY, final_status, optimality, start_status
 
 CAREFUL = ILQR(max_iterations=300)

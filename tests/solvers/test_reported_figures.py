@@ -28,8 +28,8 @@ from torchgco import (
 )
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Judged
+from torchgco.lagrangian.lagrangian import SolveEnd
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.native.compiler import find_compiler
 from torchgco.problem.horizons import within_horizons
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian

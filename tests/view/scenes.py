@@ -12,8 +12,7 @@ from torchgco import Boxes, Capsules, FunctionDynamics, Goal, Problem, Quadratic
 from torchgco.exploration.sensing.grid import FREE, OCCUPIED
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.missions.log import SeenLog
-from torchgco.view.document import Document, SearchPart
-from torchgco.view.flights import ShownFlight, flights_of
+from torchgco.view.document import Document, SearchPart, ShownFlight, flights_of
 from torchgco.view.sensed import Sensed
 from torchgco.view.vehicles import Look
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import torchgco
 from tests.view.browser import Tab
 from torchgco import Body, Boxes, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, Unicycle
-from torchgco.plotting.silhouettes import body_of
+from torchgco.plotting.bodies import body_of
 from torchgco.view.shapes import shapes_of
 from torchgco.view.vehicles import shape_of, turned
 

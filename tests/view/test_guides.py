@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.view.scenes import N, problem, trajectories
 from torchgco import Problem
 from torchgco.base.draws import DrawKey
-from torchgco.experiments.reports.searched import Watched
+from torchgco.experiments.reports.view import Watched
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.solvers.contracts import Advice
 

@@ -18,9 +18,9 @@ from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.obstacles.shapes import RoundedBoxes
-from torchgco.plotting.world import world_of
+from torchgco.plotting.scene import world_of
 from torchgco.view import document
-from torchgco.view.flights import flights_of, violated, whole
+from torchgco.view.document import flights_of, violated, whole
 from torchgco.view.packing import Packing
 from torchgco.view.shapes import Shapes, merged, once, shapes_of, turns
 from torchgco.view.vehicles import Look, look_of

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchgco.base.autodiff import jacobian
 from torchgco.dynamics.base import Dynamics, WrappedDynamics
-from torchgco.dynamics.unicycle import Unicycle
+from torchgco.dynamics.planar import Unicycle
 from torchgco.problem.problem import Problem
 from torchgco.search.steering import BRAKING as BRAKING
 from torchgco.search.steering import TURNING, WITHIN

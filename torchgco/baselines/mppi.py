@@ -12,8 +12,8 @@ from torchgco.base.errors import GuidanceWarning, InputError
 from torchgco.base.options import Count, Positive
 from torchgco.base.status import Status
 from torchgco.baselines.hold import rolled_out
+from torchgco.guidance.gco import suited_sampler
 from torchgco.guidance.mppi import MPPI
-from torchgco.guidance.suitability import suited_sampler
 from torchgco.kernels import measured
 from torchgco.lagrangian.quality import is_better
 from torchgco.obstacles.base import ADMITTED

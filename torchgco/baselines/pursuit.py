@@ -12,20 +12,18 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.tree import put, take
 from torchgco.baselines.drivers import BRAKING, Driver, Track, driver_of, own_model
-from torchgco.lagrangian.state import Iterate, SolveEnd
+from torchgco.lagrangian.lagrangian import Iterate, SolveEnd
 from torchgco.maps.ways import Ways, length
 from torchgco.obstacles.base import ADMITTED
 from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import evenly, smoothed
-from torchgco.roadmap.geometry import Scene
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import Scene, scene_of
 from torchgco.search.chords import cleared, serving
-from torchgco.search.pursue import radius_of
+from torchgco.search.tube import radius_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver
-from torchgco.solvers.infeasible import least_violated
-from torchgco.solvers.interior import InteriorPoint, guessed
+from torchgco.solvers.interior import InteriorPoint, guessed, least_violated
 from torchgco.solvers.session import Session
 
 Array = NDArray[np.float64]

@@ -6,10 +6,10 @@ imports all rooms but `experiments`. Begin with `compiled.py`.
 """
 
 from torchgco.compiled.answer import Answer as Answer
-from torchgco.compiled.command import MPPIController as MPPIController
 from torchgco.compiled.compiled import Compiled as Compiled
 from torchgco.compiled.compiled import compile as compile
 from torchgco.compiled.fleet_mpc import FleetMPC as FleetMPC
 from torchgco.compiled.mpc import MPC as MPC
+from torchgco.compiled.mpc import MPPIController as MPPIController
 from torchgco.receding.plan import Instant as Instant
 from torchgco.receding.plan import Plan as Plan

@@ -23,16 +23,14 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.answer import Answer
 from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
-from torchgco.compiled.numbered import numbers_of, with_numbers_as_they_are, with_own_numbers
-from torchgco.compiled.numbers import Numbers
+from torchgco.compiled.numbers import Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.constraints.integral import Integral
-from torchgco.explaining.account import Account
+from torchgco.explaining.explain import Account
 from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
-from torchgco.native.interior import InteriorEngine
-from torchgco.native.kept import Kept
+from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.presets import named
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times

@@ -15,10 +15,8 @@ from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_ze
 from torchgco.kernels import cost_scale, cost_unit, current, interior_of
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
-from torchgco.native.interior import InteriorEngine
-from torchgco.native.kept import Kept
-from torchgco.problem.elapsed import Elapsed
-from torchgco.problem.in_time import factors_in, factors_of, in_time, states_in_time, times_of
+from torchgco.native.interior import InteriorEngine, Kept
+from torchgco.problem.in_time import Elapsed, factors_in, factors_of, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.tracing import own_tensors

@@ -5,5 +5,5 @@ to a problem's shapes, and the one that kernels read as numbers; `function` hold
 """
 
 from torchgco.costs.base import Cost as Cost
-from torchgco.costs.function import FunctionCost as FunctionCost
+from torchgco.costs.base import FunctionCost as FunctionCost
 from torchgco.costs.quadratic import QuadraticCost as QuadraticCost

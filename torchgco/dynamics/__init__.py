@@ -6,12 +6,12 @@ it; `rollout` steps through a horizon, `names` call states and controls. It impo
 
 from torchgco.dynamics.base import Dynamics as Dynamics
 from torchgco.dynamics.base import FunctionDynamics as FunctionDynamics
-from torchgco.dynamics.bicycle import Bicycle as Bicycle
+from torchgco.dynamics.planar import Bicycle as Bicycle
 from torchgco.dynamics.planar import Planar as Planar
-from torchgco.dynamics.point_mass import PointMass as PointMass
+from torchgco.dynamics.planar import PointMass as PointMass
+from torchgco.dynamics.planar import Unicycle as Unicycle
 from torchgco.dynamics.quadrotor import Airframe as Airframe
 from torchgco.dynamics.quadrotor import QuadrotorPlanning as QuadrotorPlanning
 from torchgco.dynamics.quadrotor import QuadrotorPlant as QuadrotorPlant
+from torchgco.dynamics.quadrotor import QuadrotorThrusts as QuadrotorThrusts
 from torchgco.dynamics.quadrotor import RotorTracking as RotorTracking
-from torchgco.dynamics.rotors import QuadrotorThrusts as QuadrotorThrusts
-from torchgco.dynamics.unicycle import Unicycle as Unicycle

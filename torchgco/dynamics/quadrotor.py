@@ -1,4 +1,4 @@
-"""The quadrotor at three levels of detail: planning model (14 states), plant (17), rotor tracking (7).
+"""The quadrotor: planning model (14 states), plant (17), rotor tracking (7), and one commanded by its rotors' thrusts.
 
 Quaternions are scalar first; q' = 1/2 Qx(w) q, and R(q) e3 is the body's thrust axis in the world.
 """
@@ -292,3 +292,43 @@ class RotorTracking(Dynamics, named="rotors"):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         w, F = x[..., :3], x[..., 3:]
         return torch.cat((self.airframe.angular_acceleration(w, F, u), self.airframe.thrust_rate(F, u)), dim=-1)
+
+
+@dataclass(frozen=True)
+class QuadrotorThrusts(Dynamics, named="quadrotor"):
+    """x = [p (m), v (m/s), q, w (rad/s)], u = [F_1, ..., F_4] (N), n = 13, m = 4: `QuadrotorPlant` with instant rotors.
+
+        p' = v,  v' = sum(F) / m R(q) e3 / |q|^2 - g e3,  q' = 1/2 Qx(w) q,  w' = J^-1 (T F - w x (J w) - D w)
+
+    q isn't renormalised; the thrust's axis is a unit vector whatever its norm.
+
+    Raises:
+        InputError: a field out of its range or of another kind.
+    """
+
+    dt: Seconds = 0.05
+    integrator: Integrator = "rk4"
+    airframe: Airframe = Airframe()
+
+    n: ClassVar[int] = 13
+    m: ClassVar[int] = 4
+    position: ClassVar[slice] = slice(0, 3)
+    state_names: ClassVar[Texts] = POSE
+    state_units: ClassVar[Texts] = POSE_UNITS
+    control_names: ClassVar[Texts] = THRUSTS
+    control_units: ClassVar[Texts] = ("N",) * 4
+
+    @property
+    def control_limits(self) -> tuple[Limits, Limits]:
+        """The least and the greatest thrust of each rotor, N."""
+        return (self.airframe.thrust_min,) * 4, (self.airframe.thrust_max,) * 4
+
+    def derived(self, x: Tensor, u: Tensor) -> dict[str, Tensor]:
+        """The joint thrust of the rotors."""
+        return {"thrust [N]": u.sum(-1)}
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        _, v, q, w = x.split((3, 3, 4, 3), dim=-1)
+        lift = u.sum(-1) / self.airframe.mass / q.square().sum(-1)
+        pose = self.airframe.pose_rates(components(v), components(q), components(w), lift)
+        return torch.cat((vectors(*pose), self.airframe.angular_acceleration(w, u)), dim=-1)

@@ -18,7 +18,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Above, AtLeast, AtMost, Count, Meters, check_value
 from torchgco.base.shapes import computing_on
 from torchgco.dynamics.quadrotor import ROTORS, Airframe
-from torchgco.envs import observation
+from torchgco.envs import episodes
 from torchgco.envs.episodes import FLYING, Control, Episodes
 from torchgco.missions.mission import CPU, Mission
 from torchgco.missions.outcome import Outcome
@@ -46,7 +46,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
     from (seed, id), never from its place in the batch: environment i is the same alone. Everything is computed on the
     CPU in double precision.
 
-    Observations are float32, of `observation_names` with `observation_units`; see `observation.names`. Actions are
+    Observations are float32, of `observation_names` with `observation_units`; see `episodes.names`. Actions are
     float32 with `action_names`, `action_units`, cut off to the space's bounds, and held for the period: with control
     "rates" body rates and thrust acceleration, which the mission's tracker makes rotor speeds of; with "rotors" the
     rotor speeds. The reward is the way towards the goal in m, plus 10 at the goal, minus
@@ -105,10 +105,10 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
 
     def _spaces(self, control: Control, max_rate: float) -> None:
         """The spaces, and the names and units of their components."""
-        frame, n = self.episodes.airframe, len(observation.names(self.nearest))
+        frame, n = self.episodes.airframe, len(episodes.names(self.nearest))
         self.observation_names, self.observation_units = (
-            observation.names(self.nearest),
-            observation.units(self.nearest),
+            episodes.names(self.nearest),
+            episodes.units(self.nearest),
         )
         if control == "rates":
             self.action_names, self.action_units = ("wx", "wy", "wz", "a"), (*["rad/s"] * 3, "m/s^2")
@@ -222,7 +222,7 @@ class MissionVectorEnv(gymnasium.vector.VectorEnv):
 
     def _observed(self) -> np.ndarray:
         flying = self.episodes
-        seen = observation.observed(
+        seen = episodes.observed(
             flying.measured(), flying.goal, flying.contact.obstacles, flying.airframe, self.nearest, self.sight
         )
         return seen.to(torch.float32).numpy()

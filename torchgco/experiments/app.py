@@ -97,7 +97,7 @@ def _task(config: DictConfig) -> Report | Scored:
 def _scored(config: DictConfig, report: Report) -> Scored:
     """The report with the number of the study."""
     from torchgco.experiments.results.folder import TRIALS, read_trials
-    from torchgco.experiments.results.objective import objective_of
+    from torchgco.experiments.results.kinds import objective_of
 
     name, solver = config.study.objective, config.solver.name
     number = objective_of(read_trials(Path(report.folder) / TRIALS, trust=True), name, solver)

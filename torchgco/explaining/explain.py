@@ -5,15 +5,16 @@ from __future__ import annotations
 import textwrap
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.base.status import Status
-from torchgco.explaining.account import Account
+from torchgco.base.tree import PerElement, Rows
+from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.explaining.advice import Facts, advice, tells_to_record
-from torchgco.explaining.barred import goal_facts, map_facts
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
 from torchgco.explaining.places import caught_told, gates_told, number, place_told
 from torchgco.explaining.record import SearchRecord
@@ -21,11 +22,175 @@ from torchgco.judging.judge import columns as judged
 from torchgco.judging.steps import step_errors
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.unmoved import unmoved, without_slope
-from torchgco.obstacles.base import ADMITTED
+from torchgco.maps.field import BoundField, distance_within
+from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.passage import widest_passage
+from torchgco.obstacles.base import ADMITTED, Obstacles
+from torchgco.problem.covered import covered_goals
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
+
+
+def goal_facts(problem: Problem, X: Tensor, U: Tensor) -> dict[str, Any]:
+    """Those of `Facts` on a required goal that X (1, N+1, n), U (1, N, m) misses; none where it doesn't."""
+    row = next((constraint for constraint in problem.constraints if constraint.is_goal), None)
+    if row is None:
+        return {}
+    last = int(problem.stages[0])  # of a problem with its own horizon, whose rows stand at knot N
+    missed = float(row.worst(X[:, [last] * X.shape[1]], U))
+    if not missed > ADMITTED:
+        return {}
+    unit = " m" if row.in_metres else ""
+    return {"missed": f"{missed:.4g}{unit}", "covered": bool(covered_goals(problem))}
+
+
+def map_facts(problem: Problem, status: Status, arrived: bool) -> dict[str, Any]:
+    """Those of `Facts` that maps know, for a batch of one; none where the vehicle arrived without contact."""
+    fields = [field for field in problem.obstacles if field.map is not None]
+    if status is Status.INVALID_START:
+        return {"in_unknown": any(_is_unknown(problem, field.map) for field in fields if field.body is None)}
+    if arrived or problem.goal is None or not bool(problem.x0[:, problem.position].isfinite().all()):
+        return {}
+    facts = [fact for field in fields if field.holds_at(problem.N) and (fact := _barred(problem, field)) is not None]
+    return min(facts, key=lambda fact: fact["passage"], default={})
+
+
+def _barred(problem: Problem, obstacle: Obstacles) -> dict[str, Any] | None:
+    """The vehicle's radius and the largest that gets to the goal, where this one touches the map on every way."""
+    field = obstacle.inscribed  # of a body, as the ball meets it that the body holds
+    assert problem.goal is not None and isinstance(field, BoundField)
+    start = problem.x0[0, problem.position].detach().cpu().double().numpy()
+    goal = problem.goal.position[0].detach().cpu().double().numpy()
+    radius, goal_radius = float(field.vehicle_radius[0]), float(problem.goal.radius[0])
+    b, near = int(field.which[0]), radius - ADMITTED
+    if distance_within(field.field.source, field.field.unknown, b, start, radius) < near:
+        near = CONTACT_FACTOR * radius  # from so near a start it may leave
+    passage = widest_passage(field.field, b, start, goal, goal_radius, near)
+    if passage is None:
+        return None
+    ends = {"start": start, "goal": goal}
+    off = [name for name, point in ends.items() if passage == 0.0 and _shuts_out(field, point)]
+    return {"radius": radius, "passage": passage, "body": obstacle is not field, "off_map": off[0] if off else None}
+
+
+def _shuts_out(field: BoundField, point: np.ndarray) -> bool:
+    """Whether a place lies outside of a grid whose outermost cells are all occupied."""
+    source = field.field.single(int(field.which[0])).source
+    if not isinstance(source, OccupancyGrid) or source.holds(point):
+        return False
+    (cells,) = source.held(field.field.unknown)
+    return all(bool(cells.take((0, -1), axis).all()) for axis in range(source.d))
+
+
+def _is_unknown(problem: Problem, field: BoundField) -> bool:
+    """Whether the vehicle touches unknown cells at the start, and no others of this map."""
+    source = field.field.source
+    if not isinstance(source, OccupancyGrid) or bool(field.start_is_clear(problem.x0)[0]):
+        return False
+    p = problem.x0[0, problem.position].detach().cpu().double().numpy()
+    least = CONTACT_FACTOR * float(field.vehicle_radius[0])
+    known = distance_within(source, "free", int(field.which[0]), p, least + source.resolution)
+    return known >= least and known > 0
+
+
+class Account(PerElement):
+    """The problem that was solved, and the solver; no dataclass, so that nothing is copied with a solution's tensors.
+
+    Of a solution that was loaded or sent to another process, only the times of the knots and the kernels are left.
+
+    Args:
+        problem: as the user gave it.
+        solver: that solved it.
+        name: of the preset that the user named; None: the solver's class.
+        rows: the problems (b,) of the account; None: all.
+        t: times, where the problem isn't there.
+        kernels: that solved: "native", "pytorch", or another library's name; None where that isn't known.
+        smoothing: of the solution, in units of the cost.
+    """
+
+    def __init__(
+        self,
+        problem: Problem | None = None,
+        solver: Any = None,
+        name: str | None = None,
+        rows: Tensor | None = None,
+        t: Tensor | None = None,
+        kernels: str | None = None,
+        smoothing: float = 0.0,
+    ) -> None:
+        self._whole, self.solver, self._name, self._rows, self._t = problem, solver, name, rows, t
+        self.kernels, self.smoothing = kernels, smoothing
+
+    @property
+    def problem(self) -> Problem | None:
+        """The problems of the account; taken from the batch only when they are asked for."""
+        return self._whole if self._whole is None or self._rows is None else self._whole.take(self._rows)
+
+    @property
+    def name(self) -> str | None:
+        """What solved the problem; None where that isn't known."""
+        return type(self.solver).__name__ if self._name is None and self.solver is not None else self._name
+
+    def asked(self, problem: Problem, name: str | None) -> Account:
+        """The same of the problem as the user gave it, and of a preset of this name; None: of no preset."""
+        return Account(problem, self.solver, name, self._rows, self._t, self.kernels, self.smoothing)
+
+    def smoothed(self, by: float) -> Account:
+        """The same of the solution with a smoothing."""
+        return Account(self._whole, self.solver, self._name, self._rows, self._t, self.kernels, by)
+
+    def as_solved(self) -> Problem | None:
+        """`problem`, where its numbers are still those that were solved for.
+
+        Raises:
+            InputError: they were changed in place since.
+        """
+        if self._whole is not None and self._whole.current() is not self._whole:
+            expected = "a problem whose numbers are as they were solved: pass a copy of it as problem="
+            raise InputError("solution", expected, "one whose numbers were changed in place since")
+        return self.problem
+
+    def times(self) -> Tensor:
+        """The times of the knots, (N+1,) or (b, N+1), s.
+
+        Raises:
+            InputError: dynamics without a time step, no times in the file that was loaded, or changes in place since.
+        """
+        if self._whole is not None:
+            self.as_solved()
+            t = times(self._whole)
+        elif self._t is not None:
+            t = self._t
+        else:
+            raise InputError("solution", "one that knows its times: solved here, or saved with them", "a loaded one")
+        return t if self._rows is None or t.dim() == 1 else t[self._rows]
+
+    def take(self, index: Rows) -> Account:
+        """The account of some problems."""
+        if isinstance(index, slice):
+            like = self._t if self._whole is None else self._whole.x0
+            if self._rows is not None:
+                rows = self._rows[index]
+            elif like is None or like.dim() == 1:  # times alone, which all problems share
+                rows = None
+            else:
+                rows = torch.arange(len(like), device=like.device)[index]
+        else:
+            index = index.nonzero().flatten() if index.dtype == torch.bool else index
+            rows = index if self._rows is None else self._rows[index]
+        return Account(self._whole, self.solver, self._name, rows, self._t, self.kernels, self.smoothing)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Times and name alone: a problem may hold functions that no other process can read."""
+        try:
+            t = self.times()
+        except InputError:
+            t = None
+        return {"_whole": None, "solver": None, "_name": self.name, "_rows": None, "_t": t,
+                "kernels": self.kernels, "smoothing": self.smoothing}  # fmt: skip
+
 
 if TYPE_CHECKING:
     import pandas as pd

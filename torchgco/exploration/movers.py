@@ -9,8 +9,7 @@ import numpy as np
 from scipy.ndimage import label
 
 from torchgco.exploration.sensing.grid import FREE, OCCUPIED, SeenMap
-from torchgco.exploration.sensing.sensors import Scan
-from torchgco.exploration.sensing.world import Motion, World
+from torchgco.exploration.sensing.sensors import Motion, Scan, World
 
 BESIDE = 0.3  # m around a ball, within which returns are its own
 JOINED = 0.4  # m: returns closer than about this belong to one body

@@ -20,20 +20,21 @@ from torchgco.base.errors import InputError
 from torchgco.exploration.evading import evaded
 from torchgco.exploration.explorer import (
     CORRIDOR,
+    DRIFT,
     FLYABLE,
     PLANES,
+    SEARCH_OPTIONS,
+    SPARE,
     Explorer,
     PlanningForm,
+    Scout,
     Unknown,
     unflyable,
 )
 from torchgco.exploration.movers import Known, Movers, Tracks, Unaware
 from torchgco.exploration.safety import AT_REST, braking, ends_at_rest, former_plans
-from torchgco.exploration.scout import DRIFT, SEARCH_OPTIONS, SPARE, Scout
-from torchgco.exploration.sensing.cells import CellSearch
-from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED
-from torchgco.exploration.sensing.sensors import Sensor
-from torchgco.exploration.sensing.world import World
+from torchgco.exploration.sensing.grid import NOT_FREE, SEEN_OCCUPIED, CellSearch
+from torchgco.exploration.sensing.sensors import Sensor, World
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.missions.log import TIMED_PARTS, SeenLog
 from torchgco.missions.planner import MissionPlan, Planner

@@ -18,8 +18,7 @@ from torchgco.export.files import Build, Exported, write_files
 from torchgco.export.numbers import changing
 from torchgco.export.source import solver_source
 from torchgco.kernels import current, interior_of
-from torchgco.native.interior import InteriorEngine
-from torchgco.native.kept import Kept
+from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 

@@ -16,7 +16,7 @@ from torchgco.dynamics.names import controls_of, states_of
 from torchgco.export.numbers import Changing, Member
 from torchgco.export.source import HERE, Solver, replaced, table
 from torchgco.native.codegen.emit import literal
-from torchgco.native.kept import Kept
+from torchgco.native.interior import Kept
 
 PERIODS = 40  # of the test
 EXAMPLE = 20  # of the example

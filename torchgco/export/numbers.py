@@ -14,7 +14,7 @@ from torchgco.base import numbers as checks
 from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number
 from torchgco.compiled.numbers import Numbers
-from torchgco.native.kept import Kept
+from torchgco.native.interior import Kept
 from torchgco.native.structures import Array
 
 # What is checked of a number in C: finite, at least 0, above 0, or a bound, which may be infinite.

@@ -19,7 +19,7 @@ from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
 from torchgco.native.declarations import Structure, defines, kept_by
 from torchgco.native.includes import C
-from torchgco.native.kept import Kept
+from torchgco.native.interior import Kept
 from torchgco.native.packing import kind_of
 from torchgco.receding.plan import STAGE_ROUNDING
 from torchgco.solvers.ending import STATIONARY

@@ -20,8 +20,7 @@ from torchgco.fleets.verdict import leaves_chords, states_goal
 from torchgco.kernels import path_clearance
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import library_for
-from torchgco.search.timed import ways_in_time
-from torchgco.search.timed_guesses import guesses_along
+from torchgco.search.timed import guesses_along, ways_in_time
 from torchgco.search.timed_scenes import can_search
 from torchgco.solution import Solution
 

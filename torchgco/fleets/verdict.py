@@ -15,8 +15,8 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets.fleet import Fleet
 from torchgco.judging.judge import Verdict, judge
 from torchgco.obstacles.measured import segment_distance
-from torchgco.problem.between import PIECES_AT_MOST, between
 from torchgco.problem.problem import Problem
+from torchgco.problem.times import PIECES_AT_MOST, between
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from torchgco.judging.judge import doubled, in_double
 from torchgco.judging.steps import step_errors
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.alone import row_by_row
-from torchgco.problem.between import bends
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.times import bends
 
 HARDLY_SEEN = 1e-6  # share of the cost that a control is held to change over its range at least
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls

@@ -12,8 +12,8 @@ from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.obstacles.base import ADMITTED
 from torchgco.obstacles.measured import segment_distance
-from torchgco.problem.between import Paths, paths
 from torchgco.problem.problem import Problem
+from torchgco.problem.times import Paths, paths
 
 
 class Passes(NamedTuple):

@@ -19,12 +19,12 @@ from torchgco.constraints.base import ADMITTED, Constraint, Distance
 from torchgco.constraints.gates import has_gates
 from torchgco.judging.gates import passages
 from torchgco.judging.steps import StepErrors, step_errors
-from torchgco.judging.within import path_rows, violation_between
+from torchgco.judging.worst import path_rows, violation_between
 from torchgco.problem.alone import row_by_row
-from torchgco.problem.between import Paths, paths
 from torchgco.problem.goal import Goal
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.times import Paths, paths
 
 SUCCESS_COST = 0.05  # by how much a success may exceed the best known cost, as a share of its amount
 NUMBERS_AT_ONCE = 2**18  # numbers held at once where distances are measured: 2 MB

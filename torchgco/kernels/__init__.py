@@ -7,16 +7,16 @@ problems of a GPU to the CPU, and has their loops run on the GPU. It imports `na
 """
 
 from torchgco.kernels.choice import EagerWarning as EagerWarning
+from torchgco.kernels.choice import copied_to as copied_to
 from torchgco.kernels.choice import current as current
 from torchgco.kernels.choice import expect_interior as expect_interior
+from torchgco.kernels.choice import held_on_cpu as held_on_cpu
 from torchgco.kernels.choice import kernels_of as kernels_of
 from torchgco.kernels.choice import native as native
+from torchgco.kernels.choice import on_cpu as on_cpu
+from torchgco.kernels.choice import served_by as served_by
 from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
-from torchgco.kernels.elsewhere import copied_to as copied_to
-from torchgco.kernels.elsewhere import held_on_cpu as held_on_cpu
-from torchgco.kernels.elsewhere import on_cpu as on_cpu
-from torchgco.kernels.elsewhere import served_by as served_by
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
 from torchgco.kernels.verbs import cost_unit as cost_unit

@@ -12,19 +12,16 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.status import Status
 from torchgco.eager.sampling import Sampling
-from torchgco.ilqr import descent, lifted
-from torchgco.ilqr.descent import Descent
+from torchgco.ilqr import step as iteration
 from torchgco.ilqr.line_search import Rollouts, rungs_of
 from torchgco.ilqr.riccati import BackwardPass
-from torchgco.ilqr.step import keep_lifted
+from torchgco.ilqr.step import Descent, keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
 from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.state import InnerState, PassEnd, State
-from torchgco.native.engine import Engine
+from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
+from torchgco.native.engine import Engine, Sampler
 from torchgco.native.interior import InteriorEngine, InteriorKernels
-from torchgco.native.kept_descent import KeptDescent
-from torchgco.native.sampler import Sampler
+from torchgco.native.kept_problem import KeptDescent
 from torchgco.native.structures import Options
 from torchgco.obstacles.base import TOUCH
 from torchgco.obstacles.spheres import BoundSpheres
@@ -180,8 +177,8 @@ class NativeKernels(Kernels):
         state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in starts.items()}
         accepted, mu_r = _flags(lagrangian.problem.B), torch.zeros_like(merit)
         packed = self.engine.terms(
-            lagrangian, None, **state, converged=accepted, regularisation=mu_r, limit=lifted.LIFTED_STEPS,
-            gain=lifted.GAIN,
+            lagrangian, None, **state, converged=accepted, regularisation=mu_r, limit=iteration.LIFTED_STEPS,
+            gain=iteration.GAIN,
         )  # fmt: skip
         self.engine.run("tgco_lift", lagrangian.problem.B, packed)
         return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted != 0)
@@ -212,10 +209,10 @@ def native_options(how: Descent) -> Options:
         search.shrink, back=-1 if search.back is None else search.back,
         accept_last=printed, ratio_min=search.ratio_min, ratio_max=search.ratio_max, smallest=search.smallest,
         max_iterations=how.max_iterations, tolerance=0.0 if printed else how.tolerance,
-        absolute_tolerance=how.tolerance if printed else 0.0, rounding=descent.ROUNDED_OFF, lost=lifted.LOST_BY,
-        regularisation_first=descent.REGULARISATION_FIRST, regularisation_growth=descent.REGULARISATION_GROWTH,
-        regularisation_max=descent.REGULARISATION_MAX, damping=0.0 if printed else descent.DAMPING,
-        damping_growth=descent.DAMPING_GROWTH, damping_decay=descent.DAMPING_DECAY,
+        absolute_tolerance=how.tolerance if printed else 0.0, rounding=iteration.ROUNDED_OFF, lost=iteration.LOST_BY,
+        regularisation_first=iteration.REGULARISATION_FIRST, regularisation_growth=iteration.REGULARISATION_GROWTH,
+        regularisation_max=iteration.REGULARISATION_MAX, damping=0.0 if printed else iteration.DAMPING,
+        damping_growth=iteration.DAMPING_GROWTH, damping_decay=iteration.DAMPING_DECAY,
     )  # fmt: skip
 
 

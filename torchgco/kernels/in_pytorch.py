@@ -12,18 +12,15 @@ from torch import Tensor
 from torchgco.constraints.base import Distance
 from torchgco.dynamics import rollout
 from torchgco.eager import sampling
-from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.riccati import BackwardPass, backward
-from torchgco.ilqr.step import iterate
+from torchgco.ilqr.step import Descent, iterate
 from torchgco.kernels.outer import NativeOuter
 from torchgco.lagrangian.barrier import ROUNDINGS
-from torchgco.lagrangian.expansion import linearise
-from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, PassEnd, State, linearise
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.state import InnerState, PassEnd, State
 from torchgco.native.called import CalledInterior
 from torchgco.native.interior import InteriorKernels
-from torchgco.native.kept_descent import KeptDescent
+from torchgco.native.kept_problem import KeptDescent
 from torchgco.problem.problem import Problem
 
 

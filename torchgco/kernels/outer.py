@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from torchgco.base.status import Status
-from torchgco.ilqr import lifted
-from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.ilqr import step as iteration
+from torchgco.lagrangian.lagrangian import Lagrangian, PassEnd, State
 from torchgco.lagrangian.quality import goal_tolerance, ranks_arrival
-from torchgco.lagrangian.state import PassEnd, State
 from torchgco.native.cuda.engine import Kernel
 from torchgco.native.engine import Engine, run
 from torchgco.native.structures import End, Options, Outer
@@ -64,7 +63,7 @@ class NativeOuter:
             best_X=best.X, best_U=best.U, best_mu=best.multipliers.mu, best_cost=best.cost,
             best_violation=best.violation, base=base.contiguous(),
             **{name: values.contiguous() for name, values in goal.items()},
-            passes=1, lifted_steps=lifted.LIFTED_STEPS, lifted_gain=lifted.GAIN, **limits,
+            passes=1, lifted_steps=iteration.LIFTED_STEPS, lifted_gain=iteration.GAIN, **limits,
         )  # fmt: skip
 
     def run(self, passes: int) -> None:

@@ -15,9 +15,9 @@ from torchgco.kernels.choice import kernels_of, native
 from torchgco.kernels.in_pytorch import clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.interior import InteriorKernels
-from torchgco.problem.between import bends, bulge, paths
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
+from torchgco.problem.times import bends, bulge, paths
 
 
 def open_loop(problem: Problem, U: Tensor) -> Tensor:

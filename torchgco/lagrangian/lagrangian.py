@@ -1,4 +1,4 @@
-"""The augmented Lagrangian: value, expansion, multiplier and penalty update, violation report (Equations 17-22)."""
+"""The augmented Lagrangian: state, value, expansion, update, violation report (Equations 17-22)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,33 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import check_tensor
-from torchgco.base.tree import Rows, take
+from torchgco.base.tree import Rows, copied, take
 from torchgco.constraints.base import Sense
-from torchgco.lagrangian.expansion import quadratise
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.problem.horizons import counted
 from torchgco.problem.problem import Problem
+
+
+def linearise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """F (N, B, n+1, s) with [dx_{k+1}, 1] = F_k [dx_k, 1, du_k], around X (B, N+1, n), U (B, N, m).
+
+    Stage first, as the backward pass reads it.
+    """
+    n, m, (B, N) = problem.n, problem.m, U.shape[:2]
+    fx, fu = problem.along.jacobians(X[:, :-1], U)
+    F = X.new_zeros(N, B, n + 1, n + 1 + m)
+    F[..., :n, :n] = fx.transpose(0, 1)
+    F[..., :n, n + 1 :] = fu.transpose(0, 1)
+    F[..., n, n] = 1.0
+    return F
+
+
+def quadratise(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """H (B, N+1, s, s): gradient and Hessian of J_var at every knot; the last block has no control part."""
+    s = problem.n + 1 + problem.m
+    H = X.new_empty(*X.shape[:2], s, s)
+    problem.cost.expand(X, U, H)
+    return H
 
 
 @dataclass(frozen=True)
@@ -211,3 +232,75 @@ def update_and_raise_penalty(
         new = old + multipliers.mu.view(-1, 1, 1) * constraint.value(X, U)
         lam.append(new if constraint.sense == "equality" else new.clamp(min=0.0))
     return Multipliers(tuple(lam), (multipliers.mu * growth).clamp(max=mu_max))
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """A trajectory with its multipliers, cost and violation."""
+
+    X: Tensor  # (B, N+1, n)
+    U: Tensor  # (B, N, m)
+    multipliers: Multipliers
+    cost: Tensor  # (B,): J_var
+    violation: Tensor  # (B,)
+
+
+@dataclass
+class InnerState:
+    """The state of inner solves; the first dimension of every tensor is the running batch, b problems."""
+
+    rows: Tensor  # place in the batch
+    X: Tensor  # (b, N+1, n)
+    U: Tensor  # (b, N, m)
+    cost: Tensor  # (b,): J_var
+    merit: Tensor  # (b,): L_M
+    regularisation: Tensor  # mu_r
+    inner: Tensor  # iterations of this inner solve
+    iterations: Tensor
+    rung: Tensor  # int64: first rung of the next line search
+
+
+@dataclass(frozen=True)
+class PassEnd:
+    """How a pass ended for every running problem, (B,)."""
+
+    ended: Tensor  # bool: the inner solve has ended
+    converged: Tensor  # bool
+    stuck: Tensor  # bool: no step length was acceptable, and no regularisation is left to try
+    status: Tensor  # int64: RUNNING, or why the whole solve of the problem ends here
+    alpha: Tensor  # step length of the last iteration
+    used: Tensor  # mu_r of the last iteration
+    failed: Tensor  # bool: the backward pass failed, and no iteration was made
+
+
+@dataclass
+class State(InnerState):
+    """The state of outer loops."""
+
+    multipliers: Multipliers
+    penalty: Penalty | None  # of guidance
+    outer: Tensor  # inner solves ended
+    guided: Tensor  # outer iterations with guidance on
+    replaced: Tensor  # bool: guidance replaced the iterate, and isn't called again
+    last_cost: Tensor  # J_var at the end of the previous inner solve
+    best: Iterate  # best iterate that ended an inner solve; infinite violation before the first
+
+
+@dataclass(frozen=True)
+class SolveEnd:
+    """How every problem of a call ended, (B, ...), in the units that the solver worked in."""
+
+    best: Iterate  # the best that ended an inner solve, else the last
+    last: Iterate
+    status: Tensor  # int64: a Status, or STOPPED
+    iterations: Tensor
+    outer: Tensor
+    guided: Tensor
+
+    @classmethod
+    def blank(cls, problem: Problem, U: Tensor) -> SolveEnd:
+        """An end to be filled in, for controls like U (B, N, m)."""
+        count = torch.zeros(problem.B, dtype=torch.int64, device=U.device)
+        X, worth = U.new_zeros(problem.B, problem.N + 1, problem.n), U.new_zeros(problem.B)
+        best = Iterate(X, U.clone(), Multipliers.zero(problem, 0.0), worth, worth.clone())
+        return cls(best, copied(best), count, count.clone(), count.clone(), count.clone())

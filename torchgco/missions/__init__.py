@@ -12,6 +12,7 @@ from torchgco.missions.mission import Frame as Frame
 from torchgco.missions.mission import Mission as Mission
 from torchgco.missions.outcome import Ending as Ending
 from torchgco.missions.outcome import Outcome as Outcome
+from torchgco.missions.outcome import endings as endings
 from torchgco.missions.pilot import Pilot as Pilot
 from torchgco.missions.planner import MissionPlan as MissionPlan
 from torchgco.missions.planner import Planner as Planner
@@ -20,5 +21,4 @@ from torchgco.missions.plant import RotorPlant as RotorPlant
 from torchgco.missions.race import RaceMission as RaceMission
 from torchgco.missions.race import RacePlanner as RacePlanner
 from torchgco.missions.remote import RemotePlant as RemotePlant
-from torchgco.missions.tables import endings as endings
 from torchgco.missions.tracker import Tracker as Tracker

@@ -22,11 +22,10 @@ from torchgco.base.tree import take
 from torchgco.constraints.gates import has_gates
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
-from torchgco.missions.contact import Contact
+from torchgco.missions.contact import Contact, Passing
 from torchgco.missions.disturbance import Disturbance, measured
 from torchgco.missions.log import MissionLog
 from torchgco.missions.outcome import FARTHEST
-from torchgco.missions.passing import Passing
 from torchgco.missions.pilot import KnownMap, Pilot
 from torchgco.missions.planner import MissionPlan, Planner
 from torchgco.missions.planning_problem import airframe_of

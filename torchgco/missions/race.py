@@ -22,11 +22,10 @@ from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.constraints.gates import GateBalls, Gates, gates_of
 from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.integrators import rk4
-from torchgco.dynamics.quadrotor import with_unit_quaternion
-from torchgco.dynamics.rotors import QuadrotorThrusts
+from torchgco.dynamics.quadrotor import QuadrotorThrusts, with_unit_quaternion
+from torchgco.missions.contact import Passing
 from torchgco.missions.log import SeenLog
 from torchgco.missions.mission import Duration, Mission
-from torchgco.missions.passing import Passing
 from torchgco.missions.pilot import SEED_STEP, Pilot
 from torchgco.missions.planner import MissionPlan
 from torchgco.missions.planning_problem import airframe_of

@@ -17,7 +17,7 @@ from torchgco.costs import QuadraticCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.quadrotor import Airframe, RotorTracking
 from torchgco.lagrangian.lagrangian import Multipliers, shifted, update_and_raise_penalty
-from torchgco.missions.constraints import RotorLimits, ThrustSum
+from torchgco.missions.planning_problem import RotorLimits, ThrustSum
 from torchgco.problem.problem import Problem
 from torchgco.solvers.augmented_lagrangian import PENALTY_MAX
 from torchgco.solvers.ilqr import ILQR, RepeatedDescent

@@ -1,4 +1,4 @@
-"""iLQR in C for a batch of problems: PyTorch's tensors in the form that the library reads."""
+"""iLQR and MPPI in C for a batch of problems: PyTorch's tensors in the form that the library reads."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ import torch
 from torch import Tensor
 
 from torchgco.base.clock import setting_up
+from torchgco.base.draws import words
 from torchgco.base.errors import InputError
+from torchgco.base.shapes import repeated
 from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.norms import NormBounds
+from torchgco.eager.sampling import Sampling
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.native import structures as c
 from torchgco.native.codegen.constraint import rows_numbers, trace_rows
 from torchgco.native.codegen.cost import cost_arrays, trace_cost
-from torchgco.native.codegen.source import Form, lanes_for
+from torchgco.native.codegen.source import LANES, SAMPLER, Form, lanes_for
 from torchgco.native.codegen.stages import trace_model
 from torchgco.native.compiler import Unit, build
+from torchgco.native.cuda import source as cuda
 from torchgco.native.cuda.engine import Kernel, Library, current_device
 from torchgco.native.cuda.source import SOLVER
 from torchgco.native.packing import (
+    Captured,
+    Shared,
     constraint_of,
     guide_of,
     is_bounded,
@@ -37,7 +43,6 @@ from torchgco.native.packing import (
     quadratic_arrays,
     shared_fields,
 )
-from torchgco.native.shared import Captured, Shared
 from torchgco.native.structures import Kind, array
 from torchgco.obstacles.spheres import SpheresInFreeTime
 from torchgco.problem.problem import Problem
@@ -308,3 +313,38 @@ def _measured(constraint: Constraint) -> bool:
     while isinstance(constraint, WrappedConstraint) and constraint.keeps_rows:
         constraint = constraint.constraint
     return (type(constraint).violation, type(constraint).worst) == (Constraint.violation, Constraint.worst)
+
+
+REALS = {torch.float64: ("double", LANES), torch.float32: ("float", 2 * LANES)}  # type and lanes in C
+
+
+class Sampler:
+    """The library that samples around the controls of a form of problems, in single or double precision.
+
+    Raises:
+        NativeError: no compiler, or it refuses the source.
+    """
+
+    def __init__(self, engine: Engine, dtype: torch.dtype) -> None:
+        self.engine = engine
+        self.library = engine.further(
+            dtype, lambda: engine.form.units(SAMPLER, *REALS[dtype]), cuda.SAMPLER, REALS[dtype][0]
+        )
+
+    def improve(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
+        """See `kernels.in_pytorch.Kernels.sample`."""
+        mean = U.clone(memory_format=torch.contiguous_format)
+        wide = problem.x0.new_full((1, 1, 1, problem.m), torch.inf)
+        lower, upper = (array(bound.squeeze(2).transpose(0, 1), knots=True) for bound in how.bounds or (-wide, wide))
+        rounds = c.Sampling(
+            of=self.engine.packed(problem, X=repeated(problem.x0, problem.N + 1)), mean=mean,
+            samples=how.samples, rounds=how.rounds, knots=how.noise_knots, decay=how.decay, elite=how.elite,
+            temperature=how.temperature, collision_penalty=how.collision_penalty, dwell_cost=how.dwell_cost,
+            keys=torch.stack([words(how.key, i) for i in range(how.rounds)], dim=-1),
+            deviation=array(how.sigma.sqrt(), knots=True), lower=lower, upper=upper,
+            geometric=torch.tensor([int(row.geometric) for row in problem.constraints], dtype=torch.int32),
+        )  # fmt: skip
+        if how.left is not None and how.share is not None:
+            rounds.left, rounds.share = how.left.to(torch.int32), how.share.double()
+        run(self.library.tgco_sample, problem.B, 1, rounds)
+        return mean

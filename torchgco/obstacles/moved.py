@@ -17,10 +17,9 @@ from torchgco.base.numbers import Number, numbers, present
 from torchgco.base.shapes import Dimensions, check_shape, tensor
 from torchgco.constraints.base import Constraint, Lowered
 from torchgco.obstacles.base import ABSENT, copied, marked, picked
-from torchgco.obstacles.boxes import BoundBoxes
+from torchgco.obstacles.boxes import BoundBoxes, MovingBoxes
 from torchgco.obstacles.inputs import check_sides, dimension, is_body, own_axes, own_radii, rows
 from torchgco.obstacles.measured import Distances, box_distances, sphere_distances
-from torchgco.obstacles.moving_boxes import MovingBoxes
 from torchgco.obstacles.shapes import RoundedBoxes, array
 
 NEAR_KNOT = 1e-9  # of a step: so near to a knot is at it

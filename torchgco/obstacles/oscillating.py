@@ -16,10 +16,9 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions, check_finite, per_row
 from torchgco.constraints.base import Constraint
 from torchgco.obstacles.base import picked
-from torchgco.obstacles.boxes import BoundBoxes, Boxes
+from torchgco.obstacles.boxes import BoundBoxes, Boxes, MovingBoxes
 from torchgco.obstacles.inputs import is_body
 from torchgco.obstacles.measured import Distances, box_distances
-from torchgco.obstacles.moving_boxes import MovingBoxes
 from torchgco.obstacles.shapes import RoundedBoxes, array
 
 

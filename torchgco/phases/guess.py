@@ -11,9 +11,8 @@ from torch.nn.functional import pad
 
 from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
-from torchgco.phases.jump import Jump
 from torchgco.phases.lowered import Whole
-from torchgco.phases.phases import Phases
+from torchgco.phases.phases import Jump, Phases
 from torchgco.problem.carried import carried_of
 from torchgco.problem.in_time import fitting_factors, states_in_time
 from torchgco.problem.problem import Problem

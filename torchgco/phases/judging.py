@@ -16,8 +16,7 @@ from torchgco.judging import judge as judging
 from torchgco.judging.certificate import Certificate
 from torchgco.judging.judge import Verdict
 from torchgco.phases.phases import Phases
-from torchgco.phases.solution import PhasesSolution
-from torchgco.phases.verdict import PhasesVerdict, certify_phases, judge_phases
+from torchgco.phases.solution import PhasesSolution, PhasesVerdict, certify_phases, judge_phases
 from torchgco.problem.problem import Problem
 
 

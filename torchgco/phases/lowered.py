@@ -22,8 +22,7 @@ from torchgco.constraints.base import Constraint, WrappedConstraint
 from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.phases.jump import Jump
-from torchgco.phases.phases import Phases
+from torchgco.phases.phases import Jump, Phases
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 

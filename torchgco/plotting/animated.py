@@ -17,12 +17,11 @@ from matplotlib.patches import Circle, Polygon
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.animation import PALE
-from torchgco.plotting.bodies import ABOVE, SIDE, Plane
+from torchgco.plotting.bodies import ABOVE, SIDE, Plane, silhouettes
 from torchgco.plotting.layouts import ROCK
 from torchgco.plotting.problems import WIDTH, Course, SceneMap, courses_of, is_shared
-from torchgco.plotting.silhouettes import silhouettes
+from torchgco.plotting.scene import World, distances
 from torchgco.plotting.style import INK, TITLE
-from torchgco.plotting.world import World, distances
 from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution

@@ -19,11 +19,10 @@ from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import ADMITTED
 from torchgco.obstacles.body import BoundBody
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.bodies import Ball, Solid
+from torchgco.plotting.bodies import Ball, Solid, balls_at, silhouettes
 from torchgco.plotting.gates import Outline, draw_gates
 from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Scene, contacts, view
-from torchgco.plotting.silhouettes import balls_at, silhouettes
 from torchgco.plotting.style import INK, PALETTE
 
 VEHICLE_COLOUR = PALETTE[5]

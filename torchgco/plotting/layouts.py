@@ -19,14 +19,11 @@ from matplotlib.patches import Circle, Patch
 from torchgco.base.errors import InputError
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
+from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid, draw_body, extent
 from torchgco.plotting.gates import draw_gates
-from torchgco.plotting.grid import grid, put_head
 from torchgco.plotting.maps import draw_map, map_handles
-from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, flown, leaving, passes, scene_of, view
-from torchgco.plotting.silhouettes import draw_body, extent
-from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, solver_colours, solver_dash, tasks_of
-from torchgco.plotting.world import distances
+from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, distances, flown, leaving, passes, scene_of, view
+from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, grid, put_head, solver_colours, solver_dash, tasks_of
 
 ROCK = "#CFC8BA"
 TALLEST = 1.5  # heights of a panel as a share of its width

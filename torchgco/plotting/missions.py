@@ -1,6 +1,6 @@
 """Figures of missions: computing times, distances, snapshots, commands, states, tracking, and how missions ended.
 
-A frame has a row per control step of one mission (see `torchgco.missions.tables.mission_frame`). Those figures that
+A frame has a row per control step of one mission (see `torchgco.missions.outcome.mission_frame`). Those figures that
 show a motion alone also take a row per time step of the plant.
 """
 

@@ -22,7 +22,7 @@ from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
-from torchgco.plotting.bodies import ABOVE, SIDE, Plane
+from torchgco.plotting.bodies import ABOVE, SIDE, Plane, draw_body, extent
 from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import (
     MARKED,
@@ -35,11 +35,9 @@ from torchgco.plotting.layouts import (
     moving_handles,
 )
 from torchgco.plotting.maps import draw_map, map_handles
-from torchgco.plotting.scene import flown, leaving, passes, view
-from torchgco.plotting.silhouettes import draw_body, extent
+from torchgco.plotting.scene import World, flown, leaving, passes, view, world_of
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
-from torchgco.plotting.world import World, world_of
 from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times

@@ -14,7 +14,7 @@ from torchgco.base.shapes import MISTAKES, Dimensions, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import resolve_knots
 from torchgco.costs.base import Cost
-from torchgco.costs.in_free_time import QuadraticInFreeTime
+from torchgco.costs.quadratic import QuadraticInFreeTime
 
 A_CLOCK = "time as a state of the model's own, whose derivative is 1, says what it is"
 ALIKE = 1e-9  # difference of a stage cost from that of another stage, as a share, that is no dependence on the stage

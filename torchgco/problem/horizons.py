@@ -20,8 +20,7 @@ from torchgco.base.tree import passed_on
 from torchgco.base.values import asks_for_knot
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import bounds_of
-from torchgco.costs.base import Cost, WrappedCost, add_blocks
-from torchgco.costs.function import FunctionCost
+from torchgco.costs.base import Cost, FunctionCost, WrappedCost, add_blocks
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.problem.carried import with_carried

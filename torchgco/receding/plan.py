@@ -16,7 +16,7 @@ from torchgco.base.tree import Rows, copied, put, take
 from torchgco.constraints.bounds import Bounds
 from torchgco.dynamics.base import Dynamics
 from torchgco.lagrangian.lagrangian import shifted
-from torchgco.problem.between import between
+from torchgco.problem.times import between
 
 KNOT_ROUNDING = 1e-9  # of a stage: a time this close before a knot is the knot's
 STAGE_ROUNDING = 1e-6  # of the stages between two steps: times are sums of periods

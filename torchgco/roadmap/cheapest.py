@@ -20,7 +20,7 @@ from torchgco.native.engine import run
 from torchgco.obstacles.base import TINY, marked
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.geometry import Inflated
-from torchgco.roadmap.library import C, library_of
+from torchgco.roadmap.native_maps import C, library_of
 from torchgco.roadmap.points import CIRCLE, MIDWAY, SHELLS, directions, of_boxes
 
 HOPS = 64  # edges of a path, at most

@@ -20,10 +20,9 @@ from torch import Tensor
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import moved, take
 from torchgco.maps.ways import length
-from torchgco.roadmap.blocks import Blocks, blocks_of, tightened_by_c
 from torchgco.roadmap.cheapest import DIVERSITY, HOPS
 from torchgco.roadmap.geometry import Inflated, Scene
-from torchgco.roadmap.lattice import Array, Lattice, lattice_of, sampled
+from torchgco.roadmap.lattice import Array, Blocks, Lattice, blocks_of, lattice_of, sampled, tightened_by_c
 from torchgco.roadmap.native_maps import library_for
 
 # The most cells of a search, the clearance of free ones in spacings of the nodes, and whether free ones are merged; of

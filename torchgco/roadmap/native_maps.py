@@ -1,16 +1,46 @@
-"""The search among a map's cells in C (c/lattice.c): what it reads and writes, and its library."""
+"""The roadmap in C: its libraries, compiled at the first search, and the search among a map's cells (c/lattice.c)."""
 
 from __future__ import annotations
 
 import ctypes
+import functools
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchgco.native.declarations import Header, Structure
-from torchgco.roadmap.library import C, library_of
+from torchgco.kernels import EagerWarning
+from torchgco.native.compiler import Compiler, NativeError, build, find_compiler
+from torchgco.native.declarations import Header, Structure, defines
+from torchgco.native.includes import included, joined
+
+C = Path(__file__).parent / "c"
+
+
+def library_of(file: str, header: Header, constants: Mapping[str, Any], without: str) -> ctypes.CDLL | None:
+    """The library of a file in `C`, for these macros; None where it isn't there.
+
+    That is without a compiler, of which the solver itself warns, and where the source doesn't compile: an EagerWarning
+    says why, and what there is not then (`without`).
+    """
+    compiler = find_compiler()
+    return None if compiler is None else _library(file, header.layout, tuple(constants.items()), without, compiler)
+
+
+@functools.cache
+def _library(
+    file: str, layout: str, constants: tuple[tuple[str, Any], ...], without: str, compiler: Compiler
+) -> ctypes.CDLL | None:
+    try:
+        return build(joined(defines(dict(constants)) + included(file), C) + layout)
+    except NativeError as error:
+        warnings.warn(f"{without}: {str(error).splitlines()[0]}", EagerWarning, stacklevel=4)
+        return None
+
 
 SURE_SPACINGS = 2.0  # spacings beyond contact from which a distance is taken as it is, without interpolating
 WAY_PARTS = 4  # of the way between two blocks, for each of the larger one's layers, between which it is looked at

@@ -7,10 +7,12 @@ in double precision on the CPU wherever the problems lie; without a compiler no 
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+from copy import copy
 from ctypes import CDLL
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,10 +21,98 @@ from torchgco.base.options import AtLeast, Below, check_options
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.tree import take
 from torchgco.roadmap import cheapest
-from torchgco.roadmap.cheapest import DIVERSITY, HOPS, GraphSearch
-from torchgco.roadmap.geometry import Scene, length
-from torchgco.roadmap.known import Course, Known
+from torchgco.roadmap.cheapest import DIVERSITY, HOPS, Graph, GraphSearch
+from torchgco.roadmap.geometry import Inflated, Scene, length, points_along
 from torchgco.roadmap.mapped import paths_in_maps
+from torchgco.roadmap.points import of_boxes
+
+BYTES_KEPT = 2**26  # bytes of graphs and points that are kept for later searches in a scene
+
+
+class Course:
+    """Paths over the graphs of some problems, found one after the other; each avoids those before it.
+
+    Args:
+        rows: the problems (B',) of the scene.
+        factor: of the price of points near a path, for those after it.
+    """
+
+    def __init__(self, scene: Scene, rows: Tensor, search: GraphSearch, graph: Graph, factor: float) -> None:
+        self.scene, self.rows, self.search, self.graph, self.factor = scene, rows, search, graph, factor
+        self.price = scene.traversal_cost(graph.points, rows)  # (B', V)
+        self.paths: list[Tensor] = []  # corners (B', HOPS+1, d) of each
+        self.found = torch.zeros_like(rows, dtype=torch.bool)
+
+    def go_on(self, count: int) -> None:
+        """Find paths until there are `count`; a later one that has too many edges is the first."""
+        while len(self.paths) < count:
+            if self.paths:
+                self.price = self.search.raised(self.price, self.graph.points, self.paths[-1], self.factor)
+            path, string, arrives = self.search.cheapest(self.graph, self.price)
+            path = self.search.taut(path, string, self.scene.traversal_cost(string, self.rows))
+            if self.paths:
+                path = torch.where(arrives.view(-1, 1, 1), path, self.paths[0])
+            else:
+                self.found = arrives
+            self.paths.append(path)
+
+    def among(self, rows: Tensor) -> Course:
+        """The same of those problems that are in `rows`."""
+        at = torch.isin(self.rows, rows).nonzero().flatten()
+        if at.numel() == self.rows.numel():
+            return self
+        some = copy(self)
+        some.rows = self.rows[at]
+        some.search = replace(self.search, obstacles=take(self.search.obstacles, at))
+        some.graph, some.price, some.found = take((self.graph, self.price, self.found), at)
+        some.paths = [path[at] for path in self.paths]
+        return some
+
+
+class Points(NamedTuple):
+    """Points around the boxes of some problems of a scene."""
+
+    rows: Tensor  # (B',), ascending
+    points: Tensor  # (B', C, d)
+    exists: Tensor  # (B', C)
+
+
+class Known:
+    """What searches in a scene have found, for later ones in it."""
+
+    def __init__(self) -> None:
+        self._courses: dict[Hashable, list[Course]] = {}
+        self._points: dict[Hashable, Points] = {}
+        self._size = 0
+
+    def courses(self, key: Hashable, rows: Tensor) -> list[Course] | None:
+        """The courses of the problems in `rows`; None where some are unknown."""
+        found = [course.among(rows) for course in self._courses.get(key, [])]
+        return found if sum(course.rows.numel() for course in found) == rows.numel() else None
+
+    def keep(self, key: Hashable, courses: list[Course]) -> None:
+        """Keep courses, as long as there is room."""
+        if self._fits(sum(part.nbytes for course in courses for part in course.graph)):
+            self._courses[key] = courses
+
+    def beside(self, key: Hashable, rows: Tensor, obstacles: Inflated, scene: Scene) -> tuple[Tensor, Tensor] | None:
+        """Points (B', C, d) around the boxes of problems `rows`, ascending, and which exist; None without boxes."""
+        if obstacles.boxes is None:
+            return None
+        known = self._points.get(key)
+        if known is not None and bool(torch.isin(rows, known.rows).all()):
+            at = torch.searchsorted(known.rows, rows)
+            return known.points[at], known.exists[at]
+        points, exists = of_boxes(obstacles.boxes, obstacles.spheres, scene.start[rows], scene.goal[rows])
+        if self._fits(points.nbytes):
+            self._points[key] = Points(rows, points, exists)
+        return points, exists
+
+    def _fits(self, size: int) -> bool:
+        fits = self._size + size <= BYTES_KEPT
+        self._size += size if fits else 0
+        return fits
+
 
 NODES = 128  # points around obstacles: those of the shortest detours
 # A second search has more points, where the first had no places for all of them and found no path, or only a long one
@@ -153,3 +243,40 @@ def halton(count: int, dimension: int) -> Tensor:
             digits = digits // base
         columns.append(column)
     return torch.stack(columns, dim=-1)
+
+
+def paths_through(roadmap: Roadmap, scene: Scene, count: int, rows: Tensor, known: Known) -> tuple[Tensor, Tensor]:
+    """`roadmap.paths`, and through the gates of a scene that has some.
+
+    Of the paths of each leg the first ones follow each other, and so do the second ones: corners
+    (B', count, (G+1) (HOPS+1), d), and whether there is a path along every leg (B',).
+    """
+    if scene.gates is None:
+        return roadmap.paths(scene, count, rows, known)
+    stops = torch.cat((scene.start.unsqueeze(1), scene.gates, scene.goal.unsqueeze(1)), dim=1)
+    legs = [
+        roadmap.paths(replace(scene, start=stops[:, g], goal=stops[:, g + 1], gates=None), count, rows)
+        for g in range(stops.shape[1] - 1)
+    ]
+    corners, found = zip(*legs, strict=True)
+    return torch.cat(corners, dim=2), torch.stack(found).all(0)
+
+
+def timed(path: Tensor, places: Tensor, stages: Tensor, N: int) -> Tensor:
+    """Positions (R, N+1, d) on paths (R, P, d) of G + 1 legs, which are at gate g at the knots places (R, G).
+
+    They move slowly at both ends, and rest at the last from knot `stages` (R,) on, which need not be whole.
+    """
+    legs = places.shape[1] + 1
+    along = torch.cat((torch.zeros_like(path[:, :1, 0]), path.diff(dim=1).norm(dim=-1).cumsum(-1)), dim=1)
+    corners = path.shape[1] // legs
+    reached = torch.cat((torch.zeros_like(along[:, :1]), along[:, corners - 1 :: corners]), dim=1)  # (R, G+2)
+    knots = torch.cat((torch.zeros_like(places[:, :1]), places, stages.unsqueeze(-1)), dim=1).to(path)
+    k = torch.arange(N + 1, dtype=path.dtype, device=path.device).expand(len(path), -1)
+    knots, k = (
+        share.square() * (3.0 - 2.0 * share) for share in ((t / knots[:, -1:]).clamp(max=1.0) for t in (knots, k))
+    )
+    right = torch.searchsorted(knots.contiguous(), k.contiguous(), right=True).clamp(1, legs)
+    first, last = knots.gather(1, right - 1), knots.gather(1, right)
+    share = ((k - first) / (last - first).clamp(min=1e-12)).clamp(0.0, 1.0)
+    return points_along(path, torch.lerp(reached.gather(1, right - 1), reached.gather(1, right), share))

@@ -25,7 +25,7 @@ from torchgco.native.engine import run
 from torchgco.obstacles.base import OwnKind, Solids
 from torchgco.obstacles.box_geometry import Cuboids
 from torchgco.roadmap.lattice import Array
-from torchgco.roadmap.library import C, library_of
+from torchgco.roadmap.native_maps import C, library_of
 
 PARTS = 3  # of a move, at whose ends it is looked at
 LOOKS = 16  # layers, about, in which ways of their own are sought

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,43 @@ from torchgco.base.memory import free_memory
 from torchgco.base.options import check_value
 from torchgco.maps.distance import DistanceField
 from torchgco.maps.grid import OccupancyGrid
-from torchgco.scenarios import checks, stored_maps
-from torchgco.scenarios.stored_maps import map_arrays, map_of
+from torchgco.maps.points import PointCloud
+from torchgco.scenarios import checks
+
+GRID = ("map_occupied", "map_origin", "map_resolution")
+CLOUD = ("map_points", "map_radius")
+MAP_ARRAYS = (*GRID, *CLOUD, "map_unknown")
+
+
+def map_arrays(field: DistanceField) -> dict[str, np.ndarray]:
+    """What a field is of, by the names of a file: the cells or the points, and what unknown cells count as."""
+    source = field.source
+    if isinstance(source, OccupancyGrid):
+        values = (source.occupied, source.origin, source.resolution)
+        return {name: np.asarray(value) for name, value in zip(GRID, values, strict=True)} | {
+            "map_unknown": np.array(field.unknown)
+        }
+    return {name: np.asarray(value) for name, value in zip(CLOUD, (source.points, source.radius), strict=True)}
+
+
+def map_of(arrays: Mapping[str, np.ndarray]) -> DistanceField | None:
+    """The field of the map among these arrays; None where there is none.
+
+    Raises:
+        InputError: arrays of a map of which some are missing or malformed, named `layouts.<array>`.
+    """
+    stored = [name for name in MAP_ARRAYS if name in arrays]
+    if not stored:
+        return None
+    kind = CLOUD if "map_points" in arrays else GRID
+    if missing := [name for name in kind if name not in arrays]:
+        raise InputError(f"layouts.{missing[0]}", f"this array beside {stored[0]}", "none")
+    values = [arrays[name] for name in kind]
+    if kind is CLOUD:
+        return DistanceField.of(PointCloud(*values))
+    unknown = arrays.get("map_unknown", np.array("occupied"))
+    return DistanceField.of(OccupancyGrid(*values), str(unknown))  # type: ignore[arg-type]
+
 
 # Arrays of a file, in the order of the fields of Layouts. `layout` holds the ids, if they are not 0..L-1.
 REQUIRED = ("centers", "radii")
@@ -244,12 +279,12 @@ class Layouts:
         for name in REQUIRED:
             if name not in arrays:
                 raise InputError(f"layouts.{name}", f"this array in {path}", f"only {sorted(arrays)}")
-        known = (*NAMED_ARRAYS, *stored_maps.MAP_ARRAYS, IDS)
+        known = (*NAMED_ARRAYS, *MAP_ARRAYS, IDS)
         for name in arrays:
             if name not in known:
                 raise InputError(f"layouts.{name}", f"only {', '.join(known)}", f"this one in {path}")
         ids = arrays.pop(IDS, np.empty(0, np.int64))
-        there = {name: arrays.pop(name) for name in stored_maps.MAP_ARRAYS if name in arrays}
+        there = {name: arrays.pop(name) for name in MAP_ARRAYS if name in arrays}
         return cls(**arrays, map=map_of(there), name=path.stem, ids=ids)  # type: ignore[arg-type]
 
 

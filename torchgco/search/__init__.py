@@ -7,9 +7,7 @@ imports `roadmap`, `guidance` and `solvers`. Begin with `table.py`.
 
 from torchgco.search.candidates import Refine as Refine
 from torchgco.search.chords import ClearChords as ClearChords
-from torchgco.search.converge import Converge as Converge
-from torchgco.search.direct import Direct as Direct
-from torchgco.search.direct import Join as Join
+from torchgco.search.chords import Converge as Converge
 from torchgco.search.following import Follow as Follow
 from torchgco.search.multistart import MultiStart as MultiStart
 from torchgco.search.proposals import PathProposals as PathProposals
@@ -18,6 +16,8 @@ from torchgco.search.rows import FirstSolve as FirstSolve
 from torchgco.search.rows import Paths as Paths
 from torchgco.search.rows import Samples as Samples
 from torchgco.search.rows import Tighten as Tighten
+from torchgco.search.starts import Direct as Direct
+from torchgco.search.starts import Join as Join
 from torchgco.search.starts import Starts as Starts
 from torchgco.search.steps import FromProposal as FromProposal
 from torchgco.search.steps import FromSamples as FromSamples

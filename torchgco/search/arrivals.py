@@ -17,8 +17,7 @@ from torchgco.problem.in_time import factor_state, factors_in
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import TimedScene, TimedWays, library_for, timed_ways
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
-from torchgco.search.timed import DEARER, PROBLEMS_AT_ONCE, Timed
-from torchgco.search.timed_guesses import guesses_in_time
+from torchgco.search.timed import DEARER, PROBLEMS_AT_ONCE, Timed, guesses_in_time
 from torchgco.search.timed_scenes import Span, can_search, scene_in_time
 from torchgco.solvers.contracts import Call
 

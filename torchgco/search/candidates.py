@@ -19,7 +19,7 @@ from torchgco.lagrangian.penalties import Penalty
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import at_rest_after
 from torchgco.problem.problem import Problem
-from torchgco.roadmap import scene as seen
+from torchgco.roadmap import geometry as seen
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ilqr import ILQR, descend

@@ -17,9 +17,9 @@ from torchgco.constraints.gates import gates_of
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import GuidePath, GuideRegion, Penalty
 from torchgco.problem.problem import Problem
-from torchgco.roadmap import scene as seen
+from torchgco.roadmap import geometry as seen
 from torchgco.roadmap.geometry import Inflated, length, points_along
-from torchgco.roadmap.legs import timed
+from torchgco.roadmap.roadmap import timed
 from torchgco.search.candidates import Candidates, inner_solver
 from torchgco.search.nearby import without_obstacles
 from torchgco.solvers.ilqr import descend

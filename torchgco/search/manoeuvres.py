@@ -15,10 +15,9 @@ from torch import Tensor
 
 from torchgco.kernels import chord_clearance
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.geometry import Scene
+from torchgco.roadmap.geometry import Scene, scales, scene_of
 from torchgco.roadmap.lattice import Array, Lattice
 from torchgco.roadmap.mapped import Price, Ways, in_one, ways_of
-from torchgco.roadmap.scene import scales, scene_of
 from torchgco.search.candidates import Candidates
 from torchgco.search.chords import EXTRA
 from torchgco.search.poses import ARC_LENGTH, TIGHTEST, Poses, clear_at

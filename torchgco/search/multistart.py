@@ -11,7 +11,7 @@ from torchgco.base.draws import DrawKey, smooth_normal
 from torchgco.base.options import AtLeast, Count, check_options
 from torchgco.base.status import STALLED, Status
 from torchgco.guidance.mppi import diagonal
-from torchgco.search.best import Best
+from torchgco.search.search import Best
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Solver

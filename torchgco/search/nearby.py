@@ -20,7 +20,7 @@ from torchgco.base.tree import put
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import gates_of
 from torchgco.kernels import chord_clearance, cost_scale, measured
-from torchgco.lagrangian.state import Iterate
+from torchgco.lagrangian.lagrangian import Iterate
 from torchgco.obstacles.base import Obstacles, Solids, places_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution

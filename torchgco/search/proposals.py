@@ -25,19 +25,69 @@ from torchgco.kernels import cost_unit, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
-from torchgco.roadmap import scene as seen
+from torchgco.roadmap import geometry as seen
 from torchgco.roadmap.geometry import Scene
 from torchgco.roadmap.homotopy import classes
-from torchgco.roadmap.known import Known
-from torchgco.roadmap.legs import paths_through
-from torchgco.roadmap.roadmap import Roadmap
-from torchgco.search.candidates import CANDIDATE_PENALTY, Candidates, Refine, Watch, inner_solver, unwatched
+from torchgco.roadmap.roadmap import Known, Roadmap, paths_through
+from torchgco.search.candidates import CANDIDATE_PENALTY, Candidates, Refine, Refined, Watch, inner_solver, unwatched
 from torchgco.search.following import Follow, Free, Paths, limits_states, plain, unconstrained
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
-from torchgco.search.record import comparison
 from torchgco.search.table import Row
-from torchgco.solution import SearchRecord
+from torchgco.solution import Comparison, Fate, SearchRecord
 from torchgco.solvers.contracts import Call
+
+
+def comparison(
+    number: int,
+    rows: Tensor,
+    paths: Paths,
+    refine: Refine,
+    tracked: Candidates,
+    relaxed: Candidates,
+    sound: Tensor,
+    refined: Refined,
+    found: Tensor,
+) -> Comparison:
+    """The record of one comparison, from the candidates after each step.
+
+    Args:
+        number: of the pass in the solver's table.
+        rows: (b,) places of the problems in the batch.
+        sound: which of the relaxed candidates are, (b * count,) bool.
+        found: (b,) bool: whether there is a proposal.
+    """
+    B, C = tracked.problem.B, tracked.count
+    last = refined.candidates
+    fate = torch.where(tracked.live, int(Fate.TRACKED), int(Fate.ABSENT)).view(B, C)
+    _write(fate, relaxed, torch.where(sound, int(Fate.RELAXED), int(Fate.UNSOUND)), relaxed.live)
+    known = _written(fate, relaxed, sound.to(torch.int64), relaxed.live, 0) == 1
+    solved = known.gather(1, last.number.view(B, -1)).flatten() & (refine.top > 1)
+    good = refined.cost.isfinite()
+    _write(fate, last, torch.where(good, int(Fate.REFINED), int(Fate.FAILED)), solved)
+    chosen = torch.zeros_like(last.live)
+    chosen[refined.best[found]] = True
+    _write(fate, last, torch.full_like(last.number, int(Fate.PROPOSED)), chosen)
+    each = torch.arange(C, device=rows.device) // (C // paths.corners.shape[1])
+    empty = tracked.X.new_full((B, C, *tracked.X.shape[1:]), torch.nan)
+    cost = _written(empty[..., 0, 0], last, refined.cost, solved, torch.nan)
+    return Comparison(
+        number, rows, paths.corners, paths.classes, each.expand(B, C), fate, tracked.X.view_as(empty).clone(),
+        _written(empty, relaxed, relaxed.X, relaxed.live, torch.nan), _written(empty, last, last.X, solved, torch.nan),
+        cost,
+    )  # fmt: skip
+
+
+def _write(table: Tensor, candidates: Candidates, values: Tensor, where: Tensor) -> None:
+    """Write the values (b * count, ...) of some candidates into a table (b, C, ...), in place."""
+    chosen = where.nonzero().flatten()
+    table[chosen // candidates.count, candidates.number[chosen]] = values[chosen]
+
+
+def _written(like: Tensor, candidates: Candidates, values: Tensor, where: Tensor, empty: float) -> Tensor:
+    table = torch.full_like(like, empty)
+    _write(table, candidates, values, where)
+    return table
+
 
 WHEN = {
     "caught": "caught",

@@ -16,9 +16,8 @@ from torchgco.base.errors import NAMED
 from torchgco.base.shapes import computing_on
 from torchgco.constraints.bounds import bounds_of
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.geometry import length
+from torchgco.roadmap.geometry import length, scene_of
 from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
 
 STEP_SAMPLES = 64  # states and controls at which a step's length is looked at
 WIDE = 3.0  # the range, around 0, of what has no bounds

@@ -10,36 +10,69 @@ from typing import TYPE_CHECKING
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import check_options
-from torchgco.guidance.gco import GCO
-from torchgco.guidance.suitability import suited_guide, warn_of_losses
-from torchgco.kernels import expect_interior
-from torchgco.lagrangian.state import SolveEnd
+from torchgco.base.shapes import repeated
+from torchgco.guidance.gco import GCO, check_form, failure, suited_guide, warn_of_losses
+from torchgco.kernels import expect_interior, kernels_of
+from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, SolveEnd, linearise
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.scene import has_maps, has_paths
+from torchgco.roadmap.geometry import has_maps, has_paths
 from torchgco.search.arrivals import Arrivals
-from torchgco.search.chords import ClearChords
-from torchgco.search.converge import Converge
-from torchgco.search.freed import Freed
+from torchgco.search.chords import ClearChords, Converge, Freed
 from torchgco.search.nearby import among_nearby
 from torchgco.search.proposals import PathProposals
 from torchgco.search.reach import Horizon, horizon_of
 from torchgco.search.rows import Tighten
 from torchgco.search.search import Late, Search
-from torchgco.search.settled import settle
+from torchgco.search.solved_candidates import settle
 from torchgco.search.starts import Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
-from torchgco.search.suitability import suited_paths
 from torchgco.search.table import Passes, Row, passes_of
 from torchgco.search.through_gates import solved_through_gates
 from torchgco.search.timed import Timed
 from torchgco.solution import Solution
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Guidance, Solver
-from torchgco.solvers.infeasible import least_violated
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, least_violated
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
+
+
+def suited_paths(passes: Sequence[Row], problem: Problem) -> tuple[Sequence[Row | None], str | None]:
+    """The passes, with None for proposals along paths that can't serve; and a sentence on what is lost, or None.
+
+    Obstacles that the roadmap doesn't know by design, such as moving ones, are no loss. Initial offsets for another
+    number of controls are left out.
+    """
+    others = [None if one.seeks_paths else one for one in passes]
+    if None not in others:
+        return others, None
+    position, bodies = problem.dynamics.position, bool(problem.obstacles)
+    if position is None:
+        return others, "the dynamics have no position"
+    d = position.stop - position.start
+    if d not in (2, 3) and bodies:
+        return others, f"no path is sought around obstacles in {d}-D, as the roadmap knows only 2-D and 3-D"
+    if problem.goal is None and bodies:
+        return others, "no path is sought around obstacles without a goal: Problem(..., goal=Goal(position, radius))"
+    if not has_paths(problem):
+        return others, None
+    why = None if kernels_of(problem).compiled else failure(_expand, problem, problem.x0.dtype)
+    if why is not None:
+        return others, f"no path can be followed ({why})"
+    return [one.fitting(problem.m) for one in passes], None
+
+
+def _expand(problem: Problem) -> None:
+    """Evaluate the parts of an iLQR iteration, for one problem that stays at its start."""
+    X = repeated(problem.x0, problem.N + 1)
+    U = X.new_zeros(1, problem.N, problem.m)
+    check_form("dynamics", problem.along.step(X[:, :-1], U), X[:, :-1])
+    lagrangian = Lagrangian(problem, Multipliers.zero(problem, 1.0), None, True)
+    check_form("cost", lagrangian.value(X, U)[1], X[:, 0, 0])
+    linearise(problem, X, U)
+    lagrangian.expand(X, U)
+
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,11 +9,10 @@ from typing import ClassVar, Self
 from torchgco.base.options import Count, Natural, Positive
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import Refine
-from torchgco.search.converge import Converge
-from torchgco.search.direct import Direct, Join
+from torchgco.search.chords import Converge
 from torchgco.search.following import Follow
 from torchgco.search.proposals import PathProposals
-from torchgco.search.starts import ReleaseGoal, RequireGoal, Starts
+from torchgco.search.starts import Direct, Join, ReleaseGoal, RequireGoal, Starts
 from torchgco.search.steps import FromProposal, FromSamples, IntoGoal, Solve
 from torchgco.search.table import Row
 

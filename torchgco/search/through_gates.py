@@ -18,14 +18,12 @@ from torch import Tensor
 from torchgco.base.tree import put, take
 from torchgco.constraints.gates import gates_of
 from torchgco.kernels import path_clearance
+from torchgco.lagrangian.lagrangian import SolveEnd
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
-from torchgco.lagrangian.state import SolveEnd
 from torchgco.obstacles.base import Solids
 from torchgco.problem.in_time import factor_controls, factor_state
-from torchgco.roadmap.known import Known
-from torchgco.roadmap.legs import paths_through, timed
-from torchgco.roadmap.roadmap import Roadmap
-from torchgco.roadmap.scene import scene_of
+from torchgco.roadmap.geometry import scene_of
+from torchgco.roadmap.roadmap import Known, Roadmap, paths_through, timed
 from torchgco.search.nearby import among_nearby
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call

@@ -8,4 +8,4 @@ implicit derivative this is, `predict` a first-order guess at other numbers. It 
 from torchgco.sensitivity.attach import asks_for_gradients as asks_for_gradients
 from torchgco.sensitivity.attach import attached as attached
 from torchgco.sensitivity.attach import check_smoothing as check_smoothing
-from torchgco.sensitivity.predict import predicted as predicted
+from torchgco.sensitivity.attach import predicted as predicted

@@ -1,31 +1,75 @@
-"""Solutions with derivatives: the solve has run on numbers, and what follows it is recorded."""
+"""Solutions with derivatives: what follows a solve is recorded, and what becomes of it when its problem changes.
+
+They are computed by the problem's own functions with gradients recorded, so that no parameter has to be looked for:
+autodiff leads to tensors in the parts, to those that functions capture, and to weights of modules.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.errors import InputError
 from torchgco.base.gradients import asks, is_forward, not_recording, recording
 from torchgco.base.options import Positive, check_value
 from torchgco.base.shapes import MISTAKES, computing_on
+from torchgco.base.status import Differentiability as Why
+from torchgco.base.status import Status
 from torchgco.base.tree import copied, is_users
-from torchgco.kernels import current, open_loop
+from torchgco.explaining.explain import Account
+from torchgco.kernels import current, followed, measured, open_loop
 from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import factors_in, factors_of, states_in_time, times_of
-from torchgco.problem.problem import Problem
+from torchgco.problem.problem import Problem, current_problem
 from torchgco.sensitivity.function import Solved, System
 from torchgco.sensitivity.points import Points, gains_of, points_of
-from torchgco.sensitivity.residual import Residual, residual
 from torchgco.solution import Solution
+from torchgco.solvers.ending import judged_between
 from torchgco.solvers.timing import lifted_multipliers
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What is 0 at the solution, and the Lagrangian L = J + y' (step(x, u) - x') + lam' c."""
+
+    start: Tensor  # (B, n): the given x_0
+    x: Tensor  # (B, N+1, n): slopes of L by the states; 0 for a given start
+    u: Tensor  # (B, N, m): and by the controls
+    gaps: Tensor  # (B, N, n)
+    rows: Tensor  # (B, R): c of all constraints
+    lagrangian: Tensor  # (B,)
+
+    def take(self, rows: Tensor) -> Residual:
+        """That of the problems at `rows`, places or a mask."""
+        return Residual(**{name: values[rows] for name, values in vars(self).items()})
+
+
+def residual(problem: Problem, X: Tensor, U: Tensor, y: Tensor, lam: Tensor) -> Residual:
+    """The residual at X (B, N+1, n), U (B, N, m) with costates y (B, N+1, n) and multipliers lam (B, R).
+
+    The numbers of a given start are those of the problem; multipliers of rows that don't hold are 0.
+    """
+    with recording():
+        states, U = X.detach().clone().requires_grad_(), U.detach().clone().requires_grad_()
+        start = problem.x0
+        first = start if problem.free_start is None else torch.where(problem.free_start, states[:, 0], start)
+        Z = torch.cat((first.unsqueeze(1), states[:, 1:]), dim=1)
+        gaps = problem.along.step(Z[:, :-1], U) - Z[:, 1:]
+        rows = [constraint.value(Z, U).flatten(1) for constraint in problem.constraints]
+        c = torch.cat([gaps.new_zeros(len(gaps), 0), *rows], dim=1)
+        # Sums by problem, knots last: one over all axes would be split among threads by batch size.
+        of_rows = torch.where(lam != 0, lam * c, 0.0).sum(-1)
+        lagrangian = problem.cost.total(Z, U) + (y[:, 1:] * gaps).sum(-1).sum(-1) + of_rows
+        by_x, by_u = torch.autograd.grad(lagrangian.sum(), (states, U), create_graph=True, materialize_grads=True)
+        return Residual(start, by_x, by_u, gaps, c, lagrangian)
+
 
 EXACT_STEP = 1e-7  # share of 1 + the largest state or control that the step to the exact minimum may be
 EXACT_COSTATES = 1e-5  # share of the largest costate by which that step may change one
@@ -220,3 +264,91 @@ def for_user(problem: Problem, solution: Solution, K: Tensor) -> Solution:
     parts = {"X": solution.X[..., : problem.n], "U": solution.U[..., : problem.m], "K": K}
     times = None if problem.time is None else times_of(problem, factors_in(problem, solution.X))
     return replace(solution, **parts, multipliers=Multipliers(lam, solution.multipliers.mu), times=times)
+
+
+CROSSED = 1e-6  # by more than this a row that didn't hold is violated (the interior point's violation_tolerance)
+
+
+def predicted(solution: Solution, changed: Problem, problem: Problem | None = None) -> Solution:
+    """The solution of a problem that has changed a little, to first order: one step of Newton's method on its KKT
+    conditions, with the rows that hold as they were, and the rollout that tracks where this leads.
+
+    It costs a linear solve instead of iterations (Fiacco 1983); its error is of second order in the change. Whatever
+    the problem is made of may have changed: starts, obstacles, weights, models.
+
+    Args:
+        solution: of the problem before.
+        changed: the problem as it is now, of the same form.
+        problem: as it was; None: the one that the solution knows.
+
+    Returns:
+        X, U, multipliers, cost and violation of the changed problem, FEASIBLE where the violation is at most 1e-3 and
+        INFEASIBLE elsewhere; a solve may begin with it (`warm=`). `differentiable` says where the prediction holds,
+        and `why_not` why it doesn't: ROWS_CHANGE where a row begins or ceases to hold on the way, and the reasons of
+        the solution itself, where the controls are those of before.
+
+    Raises:
+        InputError: a problem of another form, one in float32 or with horizons per problem, a free time or rows of two
+            knots, or a solution that no longer knows its problem.
+    """
+    changed = current_problem(changed)
+    before = problem if problem is not None else solution.account and solution.account.problem
+    if before is None:
+        raise InputError("problem", "the problem that was solved", "a solution that no longer knows it")
+    if solution.account is not None and solution.account.smoothing:
+        raise InputError("solution", "one without smoothing", "one with it")
+    if current_problem(before) is not before:
+        expected = "another problem: numbers of the one that was solved have been changed in place"
+        raise InputError("changed", expected, "the changed one itself")
+    for each in (before, changed):
+        refuse_forms(each, "a prediction")
+        if for_solvers(each) is not each:
+            expected = "a problem with one horizon, a fixed time and no rows of two knots, for a prediction"
+            got = "rows of two knots" if each.time is None else "a free time"
+            raise InputError("problem", expected, got if each.horizon is None else "horizons per problem")
+    was, now = ((each.B, each.N, each.n, each.m, each.row_shapes) for each in (before, changed))
+    if was != now:
+        raise InputError("changed", f"a problem with B, N, n, m, rows as before, {was}", now)
+    with torch.no_grad(), computing_on(changed.x0.device):
+        points = points_of(current(before), solution.detach())
+        live = changed.grown(points.growth) if bool((points.growth > 0).any()) else changed
+        of = residual(live, points.solution.X, points.solution.U, points.costates, points.lam)
+        return _stepped(changed, points, of)
+
+
+def _stepped(problem: Problem, points: Points, of: Residual) -> Solution:
+    """The points one step further."""
+    old, holds = points.solution, points.reason == Why.DIFFERENTIABLE
+    system = System(points.problem, old.X, old.U, old.multipliers.lam, points.active, K=gains_of(points.problem, old))
+    x, u, _, v = (z[0].detach() for z in system.solve(*(z.detach()[None] for z in (of.x, of.u, of.gaps, of.rows))))
+    holds &= torch.isfinite(x).flatten(1).all(-1) & torch.isfinite(u).flatten(1).all(-1)
+    keep = holds.view(-1, 1, 1)
+    moved = old.X + torch.where(keep, x, 0.0)
+    X = torch.cat((problem.start_in(moved[:, 0]).unsqueeze(1), moved[:, 1:]), dim=1)
+    X, U = followed(problem, X, old.U + torch.where(keep, u, 0.0), old.K)
+    lam = points.lam + torch.where(holds.unsqueeze(-1) & points.active, v, 0.0)
+    reason = torch.where(_rows_change(problem, points, X, U, lam) & holds, int(Why.ROWS_CHANGE), points.reason)
+    worst = measured(problem, X, U)
+    status = torch.where(worst <= ADMITTED, int(Status.FEASIBLE), int(Status.INFEASIBLE))
+    status = judged_between(problem, X, U, status)
+    sizes = [rows[0].numel() for rows in old.multipliers.lam]
+    parts = zip(lam.split(sizes, dim=1), old.multipliers.lam, strict=True)
+    none = torch.zeros_like(old.iterations)
+    return replace(
+        old, X=X, U=U, multipliers=Multipliers(tuple(new.view_as(was) for new, was in parts), old.multipliers.mu),
+        cost=problem.cost.total(X, U), violation=worst, status=status, reason=reason, iterations=none,
+        outer_iterations=none, guided=none, account=Account(problem),
+    )  # fmt: skip
+
+
+def _rows_change(problem: Problem, points: Points, X: Tensor, U: Tensor, lam: Tensor) -> Tensor:
+    """Where an inequality that held pulls now, or one that didn't hold is violated, (B,) bool."""
+    change, sizes = torch.zeros(problem.B, dtype=torch.bool, device=X.device), [0]
+    for constraint in problem.constraints:
+        c = constraint.value(X, U).flatten(1)
+        rows = slice(sizes[-1], sizes[-1] + c.shape[1])
+        sizes.append(rows.stop)
+        if constraint.sense == "inequality":
+            active = points.active[:, rows]
+            change |= (torch.where(active, -lam[:, rows], c - CROSSED) > 0).any(-1)
+    return change

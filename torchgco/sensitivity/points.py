@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchgco.base.differentiability import Differentiability as Why
 from torchgco.base.draws import scattered
 from torchgco.base.status import SOLVED, Status
+from torchgco.base.status import Differentiability as Why
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import chord_clearance, cost_unit, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides

@@ -15,10 +15,17 @@ from torchgco.base.status import STOPPED, Status
 from torchgco.base.tree import copied, put, take
 from torchgco.kernels import kernels_of, measured, open_loop, value
 from torchgco.kernels.outer import NativeOuter
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers, update_and_raise_penalty
+from torchgco.lagrangian.lagrangian import (
+    Iterate,
+    Lagrangian,
+    Multipliers,
+    PassEnd,
+    SolveEnd,
+    State,
+    update_and_raise_penalty,
+)
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.lagrangian.quality import is_preferred
-from torchgco.lagrangian.state import Iterate, PassEnd, SolveEnd, State
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution

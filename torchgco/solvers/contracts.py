@@ -20,7 +20,7 @@ from torchgco.base.options import Checked, Seconds, Seed, check_value
 from torchgco.base.shapes import check_shape, check_tensor, check_untransformed, computing_on, describe
 from torchgco.base.status import Status
 from torchgco.base.tree import Rows, take
-from torchgco.explaining.account import Account
+from torchgco.explaining.explain import Account
 from torchgco.kernels import copied_to, cost_unit, current, interior_of, kernels_of, on_cpu, served_by, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion

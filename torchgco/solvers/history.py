@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchgco.kernels import measured
-from torchgco.lagrangian.state import PassEnd, State
+from torchgco.lagrangian.lagrangian import PassEnd, State
 from torchgco.problem.problem import Problem
 
 if TYPE_CHECKING:

@@ -12,12 +12,11 @@ from torch import Tensor
 from torchgco.base.options import Count, NonNegative
 from torchgco.base.status import STALLED, Status
 from torchgco.base.tree import Rows, put, take
-from torchgco.ilqr.descent import Descent
 from torchgco.ilqr.line_search import LineSearch
+from torchgco.ilqr.step import Descent
 from torchgco.kernels import kernels_of, measured
-from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
-from torchgco.lagrangian.state import InnerState, Iterate, PassEnd, SolveEnd
-from torchgco.native.kept_descent import KeptDescent
+from torchgco.lagrangian.lagrangian import InnerState, Iterate, Lagrangian, Multipliers, PassEnd, SolveEnd
+from torchgco.native.kept_problem import KeptDescent
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution

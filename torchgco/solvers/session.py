@@ -12,9 +12,8 @@ from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import Rows, is_users, put, spread, take
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import kernels_of, measured, reproducible
-from torchgco.lagrangian.lagrangian import Lagrangian
+from torchgco.lagrangian.lagrangian import Iterate, Lagrangian, SolveEnd
 from torchgco.lagrangian.quality import violation
-from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.covered import covered_goals
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call

@@ -25,17 +25,14 @@ from torchgco.base.tree import put, spread, take
 from torchgco.constraints.gates import gates_of
 from torchgco.costs.base import WrappedCost
 from torchgco.kernels import open_loop, path_clearance
-from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.lagrangian.lagrangian import Iterate, Multipliers, SolveEnd
 from torchgco.lagrangian.quality import is_better
-from torchgco.lagrangian.state import Iterate, SolveEnd
 from torchgco.problem.in_time import at_held_times, factors_in, fitting_factors, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
-from torchgco.solvers.convexity import looks_convex
-from torchgco.solvers.drawn import KNOTS, STREAM, controls_of
+from torchgco.solvers.convexity import KNOTS, STREAM, controls_of, looks_convex
 from torchgco.solvers.history import appended, in_units
-from torchgco.solvers.linear_time import LinearTime
-from torchgco.solvers.straight import Legs, straight_line
+from torchgco.solvers.straight import Legs, LinearTime, straight_line
 
 HELD_FIRST = 1.5  # the first time that is held, as a multiple of an estimate
 HELD_NEXT = 2.0  # the next one, of the one before

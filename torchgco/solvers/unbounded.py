@@ -9,7 +9,7 @@ from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.draws import uniform
 from torchgco.dynamics.rollout import open_loop as rolled_out
 from torchgco.kernels import cost_scale, cost_unit, measured, open_loop
-from torchgco.lagrangian.state import Iterate
+from torchgco.lagrangian.lagrangian import Iterate
 from torchgco.problem.problem import Problem
 from torchgco.solvers.ending import STATIONARY
 

@@ -14,8 +14,7 @@ from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
-from torchgco.view.document import Document
-from torchgco.view.flights import Rows, flights_of
+from torchgco.view.document import Document, Rows, flights_of
 from torchgco.view.page import page
 from torchgco.view.searches import search_of
 from torchgco.view.vehicles import look_of

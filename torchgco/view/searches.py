@@ -7,8 +7,7 @@ from torch import Tensor
 
 from torchgco.problem.problem import Problem
 from torchgco.solution import Comparison, Fate, SearchRecord, Solution
-from torchgco.view.document import Line, SearchPart
-from torchgco.view.flights import whole
+from torchgco.view.document import Line, SearchPart, whole
 
 SEARCH_STEPS = ("tracked", "relaxed", "refined")
 

@@ -16,7 +16,7 @@ from torchgco.dynamics import Bicycle, Dynamics, QuadrotorPlanning, QuadrotorPla
 from torchgco.dynamics.names import states_of
 from torchgco.obstacles.attitude import QUATERNION
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.silhouettes import body_of, rotations
+from torchgco.plotting.bodies import body_of, rotations
 from torchgco.problem.problem import Problem
 from torchgco.view.shapes import NOT_TURNED, turns
 

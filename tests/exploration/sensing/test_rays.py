@@ -12,7 +12,7 @@ from torchgco import Boxes, Capsules, ControlBounds, Problem, QuadraticCost, Qua
 from torchgco.base.errors import InputError
 from torchgco.constraints import FunctionConstraint
 from torchgco.exploration.sensing import World
-from torchgco.exploration.sensing.world import Motion
+from torchgco.exploration.sensing.sensors import Motion
 from torchgco.maps import DistanceField, Field, OccupancyGrid, PointCloud
 from torchgco.obstacles.base import Obstacles
 

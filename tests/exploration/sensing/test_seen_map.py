@@ -10,7 +10,6 @@ from scipy.sparse.csgraph import dijkstra
 
 from tests.reference.sensing import chords, cubes, distances, inside
 from torchgco.exploration.sensing import Lidar, Scan, SeenMap, World, library
-from torchgco.exploration.sensing.cells import CellSearch
 from torchgco.exploration.sensing.grid import (
     CHORD,
     FREE,
@@ -22,8 +21,9 @@ from torchgco.exploration.sensing.grid import (
     OCCUPIED_AT,
     REACH,
     UNKNOWN,
+    CellSearch,
 )
-from torchgco.exploration.sensing.world import Motion
+from torchgco.exploration.sensing.sensors import Motion
 
 CORNER, SIZE, SHAPE = np.array([-2.0, -1.5, -1.0]), 0.25, (17, 13, 9)
 SPAN = np.array(SHAPE) * SIZE

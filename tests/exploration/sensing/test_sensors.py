@@ -5,8 +5,7 @@ import pytest
 
 from torchgco.base.errors import InputError
 from torchgco.exploration.sensing import Depth, Lidar, World
-from torchgco.exploration.sensing.sensors import turned
-from torchgco.exploration.sensing.world import Motion
+from torchgco.exploration.sensing.sensors import Motion, turned
 
 NOWHERE, LEVEL = np.zeros(3), np.array([1.0, 0, 0, 0])
 

@@ -21,14 +21,12 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import DEFAULT_LAYOUTS, Setup, compose
 from torchgco.experiments.config.checks import check_once
-from torchgco.experiments.dataset.card import write_card
-from torchgco.experiments.dataset.rows import ABOUT, MAP, files_of, rows_of
+from torchgco.experiments.dataset.rows import ABOUT, MAP, files_of, rows_of, write_card
 from torchgco.experiments.ending import say
 from torchgco.experiments.flying.flight import Batch, Flown, Schedule, SolveBatch, check_time, plan_of
 from torchgco.experiments.flying.metrics import check_metrics
 from torchgco.experiments.flying.tasks import Tasks
-from torchgco.experiments.flying.together import cut, fly_all, trial_bar
-from torchgco.experiments.flying.workers import Shared
+from torchgco.experiments.flying.workers import Shared, cut, fly_all, trial_bar
 from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import checksum, create, damaged, readable, write
 from torchgco.experiments.results.folder import COLUMNS
@@ -36,7 +34,7 @@ from torchgco.experiments.results.identity import decisive, difference, layout_d
 from torchgco.experiments.results.lock import held
 from torchgco.experiments.results.provenance import recorded, source
 from torchgco.scenarios import Task
-from torchgco.scenarios.stored_maps import MAP_ARRAYS, map_arrays
+from torchgco.scenarios.layouts import MAP_ARRAYS, map_arrays
 
 COMMAND = "torchgco-dataset"
 LeftOut = Literal["X", "K", "multipliers"]

@@ -16,21 +16,18 @@ from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import Setup, build, solver_of
 from torchgco.experiments.ending import say
-from torchgco.experiments.flying.fleet_flight import FleetBatch, check_fleets
 from torchgco.experiments.flying.flight import Batch, Schedule, SolveBatch, check_time, plan_of
 from torchgco.experiments.flying.metrics import check_metrics
-from torchgco.experiments.flying.mission_flight import PLANS_KEPT, MissionBatch
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT, FleetBatch, MissionBatch, check_fleets
 from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
-from torchgco.experiments.flying.together import cut, fly_all, trial_bar
-from torchgco.experiments.flying.workers import Shared
+from torchgco.experiments.flying.workers import Shared, cut, fly_all, trial_bar
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
 from torchgco.experiments.reports.fleet_report import write_fleet_report
-from torchgco.experiments.reports.mission_report import mission_table, write_mission_report
-from torchgco.experiments.reports.report import write_report
+from torchgco.experiments.reports.report import mission_table, write_mission_report, write_report
 from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.durations import states_of, times_at
-from torchgco.experiments.results.folder import COLUMNS, DONE, JUDGED, StudyFolder
+from torchgco.experiments.results.folder import COLUMNS, DONE, JUDGED, StudyFolder, with_success
 from torchgco.experiments.results.identity import (
     Manifest,
     closed_loop,
@@ -40,11 +37,10 @@ from torchgco.experiments.results.identity import (
     layout_digests,
     settings_of,
 )
+from torchgco.experiments.results.kinds import check_objective
 from torchgco.experiments.results.lock import held
-from torchgco.experiments.results.objective import check_objective
+from torchgco.experiments.results.merge import values_of
 from torchgco.experiments.results.provenance import recorded
-from torchgco.experiments.results.success import with_success
-from torchgco.experiments.results.variants import values_of
 from torchgco.missions import Mission
 from torchgco.scenarios import Layouts, Task
 

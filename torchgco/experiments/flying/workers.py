@@ -1,10 +1,11 @@
-"""Work in several processes that survives the death of some of them."""
+"""Work in several processes that survives the death of some of them: batches side by side, or one after the other."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -12,10 +13,16 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
+import torch
+from tqdm import tqdm
+
 from torchgco.base import notices
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import Noted, raised
-from torchgco.experiments.flying.progress import NoBar
+from torchgco.experiments.flying.flight import Batch, Flown, fly, prepare
+from torchgco.experiments.flying.progress import BAR_FORMAT, Lines, NoBar, lines_alone
+from torchgco.kernels import native
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -151,3 +158,50 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+def cut(ids: Sequence[int] | np.ndarray, size: int) -> list[list[int]]:
+    """The ids in batches of at most `size` that follow each other without a gap."""
+    runs = np.split(np.array(ids, int), np.flatnonzero(np.diff(ids) != 1) + 1)
+    return [run[first : first + size].tolist() for run in runs for first in range(0, len(run), size)]
+
+
+def trial_bar(name: str, count: int, left: int) -> tqdm | Lines:
+    """Progress over the trials that this process flies, those flown before included."""
+    if lines_alone():
+        return Lines(name, count, count - left)
+    return tqdm(total=count, initial=count - left, unit="trial", dynamic_ncols=True, bar_format=BAR_FORMAT)
+
+
+def fly_all(flights: Sequence[Batch], workers: int, bar: tqdm | Lines, keep: Callable[[Flown], None]) -> None:
+    """Fly all batches, and `keep` what each returns, in this process."""
+    if workers > 1:
+        return _side_by_side(flights, workers, bar, keep)
+    for flight in flights:  # in this process, with a bar that moves inside a batch
+        bar.set_description(flight.name)
+        keep(fly(flight))
+
+
+def _side_by_side(flights: Sequence[Batch], workers: int, bar: tqdm | Lines, keep: Callable[[Flown], None]) -> None:
+    shown, total = 0.0, sum(len(flight.places) for flight in flights)
+
+    def watch(finished: float) -> None:
+        nonlocal shown
+        bar.update(max(0.0, finished - shown))
+        shown = max(shown, finished)
+        bar.set_postfix_str(f"solved {int(shown)}/{total}", refresh=True)
+
+    bar.set_description("compiling")
+    for first in {flight.name: flight for flight in reversed(flights)}.values():
+        first.compile()
+    bar.set_description(f"{workers} processes")
+    run_all(
+        fly,
+        flights,
+        workers,
+        prepare=prepare,
+        options=(torch.get_num_threads(), native()),
+        keep=keep,
+        watch=watch,
+        say=lambda line: bar.write(line, sys.stderr),
+    )

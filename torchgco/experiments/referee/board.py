@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
 
 from torchgco.base.errors import InputError, first_line
 from torchgco.experiments.config.build import compose_config, vehicle_of
@@ -16,12 +17,87 @@ from torchgco.experiments.config.groups import ANYWHERE
 from torchgco.experiments.referee.controls import Controls, read_controls
 from torchgco.experiments.referee.entries import Entry, entries_of, layouts_of
 from torchgco.experiments.referee.page import Board, Cell, page
-from torchgco.experiments.referee.verdicts import AT_ONCE, judged
+from torchgco.experiments.results.durations import judged_columns, states_of, times_at
+from torchgco.experiments.results.folder import COLUMNS, with_success
+from torchgco.experiments.results.identity import layout_digests
 from torchgco.experiments.results.limits import check_stages, read_layouts, read_npz
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.experiments.statistics.tables import rate
-from torchgco.scenarios import Layouts, Vehicle
+from torchgco.judging.certificate import certify
+from torchgco.judging.certificate import frame_columns as certificate_columns
+from torchgco.scenarios import Layouts, Task, Vehicle
 from torchgco.scenarios.vehicle import BUILT_IN, fitting
+
+AT_ONCE = 64  # layouts judged at once
+# How a row's status calls controls that are given in part, or not at all; others are FEASIBLE, INFEASIBLE, NON_FINITE.
+ABSENT, INCOMPLETE = "ABSENT", "INCOMPLETE"
+UNKNOWN: Mapping[str, Any] = {
+    "iterations": np.nan, "outer_iterations": np.nan, "guided": np.nan, "batch_size": np.nan, "threads": np.nan,
+    "device": "", "dtype": "", "kernels": "", "version": "",
+}  # fmt: skip
+
+
+def judged(
+    layouts: Layouts, vehicle: Vehicle, model: Mapping[str, Any], controls: Sequence[Controls], seed: int = 0
+) -> pd.DataFrame:
+    """A row per solver and layout, with the columns of a study.
+
+    What a foreign solver alone could say (iterations, threads) is missing. Its name and controls are its settings, so
+    that a report tells two submissions of one name apart.
+
+    Args:
+        model: the vehicle's node of the configuration, of which layouts have their digests.
+        seed: of the studies that rows are to be compared with.
+
+    Raises:
+        InputError: layouts that don't fit the vehicle, or a solver's name that is given twice.
+    """
+    names = [solver.name for solver in controls]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError("CONTROLS", "another name for each solver (the file's, or its `solver`)", f"{name} twice")
+    tasks = [(places, vehicle.task(layouts.take(places))) for places in layouts.together(AT_ONCE)]
+    tables = [_rows(task, solver, places) for solver in controls for places, task in tasks]
+    rows = pd.concat(tables, ignore_index=True)
+    digests = layout_digests(vehicle.at_rest(layouts), model)
+    rows = rows.assign(
+        scenario=layouts.name, seed=seed, model=vehicle.name, layout_digest=rows["layout"].map(digests), **UNKNOWN
+    )
+    order = [f"{name}\n{number:020d}" for name in names for number in layouts.ids.tolist()]
+    keys = [f"{row.solver}\n{row.layout:020d}" for row in rows[["solver", "layout"]].itertuples()]
+    rows = rows.iloc[pd.Index(keys).get_indexer(pd.Index(order))].reset_index(drop=True)
+    rows = with_success(rows, layouts, len(controls))
+    return rows[[*COLUMNS, *(name for name in rows.columns if name not in COLUMNS)]]
+
+
+def _rows(task: Task, solver: Controls, places: np.ndarray) -> pd.DataFrame:
+    """The rows of one solver on layouts that a batch can hold."""
+    problem = task.problem
+    U = torch.from_numpy(solver.U[places, : problem.N])
+    times = times_at(solver.times, places, problem.N)
+    if times is not None:  # of a layout that is lacking the times are, too
+        times = torch.where(times.isfinite().all(-1, keepdim=True), times, _usual(task))
+    verdict, columns = judged_columns(task, U, times)
+    X = states_of(problem, U, times)
+    certificate = certify(problem, X, U, verdict.feasible, times=times)
+    lacking, stages = solver.lacking[places], problem.stages.numpy()
+    finite = torch.isfinite(X).flatten(1).all(-1).numpy()
+    status = np.where(verdict.feasible.numpy(), "FEASIBLE", np.where(finite, "INFEASIBLE", "NON_FINITE"))
+    status = np.where(lacking >= stages, ABSENT, np.where(lacking > 0, INCOMPLETE, status))
+    return pd.DataFrame(
+        {
+            "layout": task.layouts.ids, "solver": solver.name, "status": status, **columns,
+            **certificate_columns(certificate),
+            "seconds": solver.seconds[places], "settings_digest": solver.digest,
+        }
+    )  # fmt: skip
+
+
+def _usual(task: Task) -> torch.Tensor:
+    """The times (N+1,) of knots at the usual distance."""
+    dt = task.problem.dynamics.dt
+    return torch.arange(task.problem.N + 1, dtype=torch.float64) * float(dt)
+
 
 NOTES = (
     "Every trajectory is simulated again from its controls, in float64, and judged by the same code; no code of an "
@@ -31,7 +107,7 @@ NOTES = (
 )
 OF_MODEL = ("model=", "model.", "vehicle=", "vehicle.")  # how words begin that have an effect
 SHOWN = 10_000  # rows of single layouts on a page, at most: some 4 MB
-COLUMNS: dict[str, str] = {
+RATED: dict[str, str] = {
     "success": "reached at no more than 5 % above the best known cost",
     "reached": "feasible, and within the goal's radius at the end",
     "feasible": "all constraints within 1e-3, no contact between the knots either",
@@ -112,7 +188,7 @@ def judged_page(trials: pd.DataFrame) -> str:
     """The page of one file's layouts: a row per solver, and a row per solver and layout."""
     summary, name = summarise(trials), str(trials["scenario"].iloc[0])
     rows = [[Cell(str(row["solver"])), *_cells(row, trials)] for _, row in summary.iterrows()]
-    heads = [("solver", "as its file names it"), *COLUMNS.items()]
+    heads = [("solver", "as its file names it"), *RATED.items()]
     every = [("solver", "as its file names it"), ("layout", "its number in the file"), *EACH.items()]
     shown = trials.head(SHOWN)
     single = [[_text(row["solver"]), _number(row["layout"], "{:.0f}"), *_each(row)] for _, row in shown.iterrows()]
@@ -145,7 +221,7 @@ def _each(row: pd.Series) -> list[Cell]:
 
 
 def _cells(row: pd.Series, trials: pd.DataFrame) -> list[Cell]:
-    """The cells of COLUMNS, from a row of a summary and the trials that it counts."""
+    """The cells of RATED, from a row of a summary and the trials that it counts."""
     flights = trials[trials["solver"] == row["solver"]]
     shares = [Cell(rate(name)(row), float(row[f"{name}_rate"])) for name in ("success", "reached", "feasible")]
     median, most = row["cost_ratio_median"], row["cost_ratio_p90"]
@@ -212,7 +288,7 @@ def leaderboard(
             rows.append([_text(name), _text(entry.name), *_cells(row, trials), *_said(entry)])
             counted = row.drop(["scenario", "solver", "seed"])
             table.append({"layouts": name, "entry": entry.id, **_card(entry), **counted})
-    heads = [("layouts", "the file that is flown"), ("entry", "name of the solver"), *COLUMNS.items(), *SAID.items()]
+    heads = [("layouts", "the file that is flown"), ("entry", "name of the solver"), *RATED.items(), *SAID.items()]
     boards = [Board("Results", heads, rows), Board("Entries", CARD_HEADS, [_shown(entry) for entry in entries])]
     if refused:
         lines = [[_text(what), _text(error)] for what, error in refused.items()]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from torchgco.base.errors import InputError
 from torchgco.base.extras import imported
 from torchgco.obstacles.attitude import QUATERNION
-from torchgco.problem.sampled import RATE_OF_POSITION, SECOND_RATE, TIME_COLUMN
+from torchgco.problem.times import RATE_OF_POSITION, SECOND_RATE, TIME_COLUMN
 
 Storage = Literal["mcap", "sqlite3"]
 FRAME, BODY = "map", "base_link"

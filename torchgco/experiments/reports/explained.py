@@ -12,8 +12,7 @@ import torch
 from torchgco.base.status import Status
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.explaining.advice import Facts, advice
-from torchgco.explaining.barred import map_facts
-from torchgco.explaining.explain import LINE_WIDTH, explanation
+from torchgco.explaining.explain import LINE_WIDTH, explanation, map_facts
 
 EXPLAINED = 8  # layouts at most
 

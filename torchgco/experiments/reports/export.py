@@ -28,8 +28,7 @@ from torchgco.experiments.statistics.statistics import PAIR, swept_columns
 from torchgco.experiments.statistics.tables import csv_text
 from torchgco.export import export_c
 from torchgco.export.files import Build
-from torchgco.problem.sampled import TIME_COLUMN, sample_times, sampled
-from torchgco.problem.times import times
+from torchgco.problem.times import TIME_COLUMN, sample_times, sampled, times
 
 FOLDER = "export"
 ATTITUDE_STATES, VELOCITY = slice(6, 10), slice(3, 6)  # of the plant's states

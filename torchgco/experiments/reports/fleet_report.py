@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchgco.experiments.flying.fleet_flight import VEHICLES, vehicles_table
+from torchgco.experiments.flying.mission_flight import VEHICLES, vehicles_table
 from torchgco.experiments.flying.progress import draw
 from torchgco.experiments.reports.report import write_report
 from torchgco.experiments.results.files import write

@@ -19,9 +19,8 @@ import torch
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.config.build import metrics_of
-from torchgco.experiments.flying.fleet_flight import VEHICLES, fleet_columns, vehicles_table
 from torchgco.experiments.flying.metrics import metric_columns
-from torchgco.experiments.flying.mission_flight import FAILED
+from torchgco.experiments.flying.mission_flight import FAILED, VEHICLES, fleet_columns, vehicles_table
 from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study
 from torchgco.experiments.results.durations import judged_columns
 from torchgco.experiments.results.files import damaged, readable
@@ -31,19 +30,18 @@ from torchgco.experiments.results.folder import (
     MANIFEST,
     TRIALS,
     StudyFolder,
+    with_success,
 )
 from torchgco.experiments.results.identity import closed_loop, layout_digests
 from torchgco.experiments.results.kinds import joined, parts_of
 from torchgco.experiments.results.limits import read_table
+from torchgco.experiments.results.merge import values_of
 from torchgco.experiments.results.runs import below
-from torchgco.experiments.results.success import with_success
-from torchgco.experiments.results.variants import values_of
 from torchgco.experiments.statistics.statistics import swept_columns
 from torchgco.experiments.statistics.tables import aligned, csv_text
 from torchgco.fleets.drawn import solution_of
 from torchgco.missions.contact import Contact
-from torchgco.missions.outcome import Outcome
-from torchgco.missions.tables import STATES, step_columns
+from torchgco.missions.outcome import STATES, Outcome, step_columns
 from torchgco.scenarios import Layouts
 
 TOLERANCE = 1e-8  # of numbers, relative above 1: other processors and libraries round differently

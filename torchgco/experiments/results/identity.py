@@ -21,8 +21,7 @@ import numpy as np
 from torchgco.experiments.results.files import checksum
 from torchgco.maps.distance import DistanceField
 from torchgco.scenarios import Layouts
-from torchgco.scenarios.layouts import BINDS, BOXES, GATES, REQUIRED, SINES, SPHERES, TIME
-from torchgco.scenarios.stored_maps import map_arrays
+from torchgco.scenarios.layouts import BINDS, BOXES, GATES, REQUIRED, SINES, SPHERES, TIME, map_arrays
 
 ARITHMETIC = ("name", "dtype", "kernels")  # keys of `device` that decide results
 # Keys of `model.vehicle` that layouts may override, and by which of their fields.

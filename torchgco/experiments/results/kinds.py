@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 import pandas as pd
 
+from torchgco.base.errors import InputError
 from torchgco.experiments.results.files import write
-from torchgco.experiments.statistics.missions import MISSIONS_AT_ONCE, summarise_missions
+from torchgco.experiments.statistics.missions import MEANS, MEDIANS, MISSIONS_AT_ONCE, summarise_missions
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import (
+    EFFORT,
     MAKESPAN,
     OUTCOMES,
     PAPER_OUTCOME,
@@ -167,3 +170,36 @@ def format_report(parts: Sequence[Part], form: str) -> str:
         return json.dumps({name: json.loads(format_frame(table, form)) for name, table in tables.items()}, indent=1)
     tables = [table for part in parts for table in part.kind.printed(part.summary, part.paired)]
     return "\n\n".join(format_frame(table, form) for table in tables)
+
+
+QUANTILES = [f"{name}_{suffix}" for name in ("cost_ratio", *EFFORT) for suffix in ("median", "p90")]
+OF_TRAJECTORIES = (
+    *(f"{name}_rate" for name in (*OUTCOMES, PAPER_OUTCOME)), "cost_median_reached", "cost_median", "violation_median",
+    *QUANTILES,
+)  # fmt: skip
+OF_MISSIONS = (*(f"{outcome.name.lower()}_rate" for outcome in Outcome), *MEDIANS, *MEANS)
+
+
+def check_objective(name: object, missions: bool) -> None:
+    """Check that a study has a number of this name for its solver: a column of the summary.
+
+    Raises:
+        InputError: it has none.
+    """
+    names = OF_MISSIONS if missions else OF_TRAJECTORIES
+    if name not in names:
+        near = get_close_matches(str(name), names, n=1)
+        expected = f"a number of the summary, such as {', '.join(near or names[:2])}"
+        raise InputError("study.objective", expected, name)
+
+
+def objective_of(trials: pd.DataFrame, name: str, solver: str) -> float:
+    """The number of a solver in a study's trials.
+
+    Raises:
+        InputError: it isn't defined for these trials, as success is without a best cost.
+    """
+    value = float(parts_of(trials)[0].summary.set_index("solver")[name][solver])
+    if value != value:
+        raise InputError("study.objective", "a number that these trials define", f"{name}, which is undefined")
+    return value

@@ -20,7 +20,7 @@ import pyarrow.parquet
 from torchgco.base.errors import InputError
 from torchgco.base.files import npz_size, regular
 from torchgco.base.memory import limited
-from torchgco.missions.tables import STATES
+from torchgco.missions.outcome import STATES
 from torchgco.scenarios import Layouts, Vehicle
 
 LARGEST_FILE = 2**30  # bytes of one file when it is read; the files of 10,000 layouts and ten solvers take a third

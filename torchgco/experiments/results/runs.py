@@ -21,10 +21,10 @@ from torchgco.experiments.results.folder import (
     read_manifest,
     read_trials,
     table_of,
+    with_success,
 )
 from torchgco.experiments.results.identity import Manifest
 from torchgco.experiments.results.limits import read_layouts
-from torchgco.experiments.results.success import with_success
 from torchgco.experiments.statistics.statistics import PAIR
 from torchgco.scenarios import LayoutFile, Layouts
 

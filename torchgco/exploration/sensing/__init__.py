@@ -5,4 +5,4 @@ from torchgco.exploration.sensing.sensors import Depth as Depth
 from torchgco.exploration.sensing.sensors import Lidar as Lidar
 from torchgco.exploration.sensing.sensors import Scan as Scan
 from torchgco.exploration.sensing.sensors import Sensor as Sensor
-from torchgco.exploration.sensing.world import World as World
+from torchgco.exploration.sensing.sensors import World as World

@@ -15,7 +15,7 @@ from torchgco.base.extras import imported
 from torchgco.dynamics.quadrotor import RADIANS, Airframe
 from torchgco.missions.drone_models import WXYZ, XYZW
 from torchgco.missions.simulators.each import EachPlant
-from torchgco.missions.simulators.mjcf import ROTOR_CORNERS
+from torchgco.missions.simulators.mujoco import ROTOR_CORNERS
 
 ODE_SOLVER = {"method": "RK45", "rtol": 1e-6, "atol": 1e-9}  # the package's own tolerance is 1e-3 of a step
 
