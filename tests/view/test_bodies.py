@@ -64,7 +64,7 @@ def test_a_quaternion_turns_a_body_in_space() -> None:
 
 def test_obstacles_keep_their_size() -> None:
     problem = drive(Body.covering([-0.9, -0.3], [0.5, 0.3], [4, 2]))
-    shapes = shapes_of(problem.obstacles[0].inscribed, 0)
+    shapes = shapes_of(problem.obstacles[0].inscribed, 0, 1.0)
     assert shapes is not None and shapes.half.tolist() == [[0.4, 3.0]]
     np.testing.assert_allclose(shapes.radius, 0.0, atol=1e-12)
 

@@ -12,7 +12,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.view.scenes import DT, RADIUS, SOLVERS, N, problem, trajectories
-from torchgco import Boxes, Field, FunctionDynamics, Moved, Planar, Problem, QuadraticCost, QuadrotorPlanning, Unicycle
+from torchgco import (
+    Boxes,
+    Field,
+    FunctionDynamics,
+    Moved,
+    OscillatingBoxes,
+    Planar,
+    Problem,
+    QuadraticCost,
+    QuadrotorPlanning,
+    Unicycle,
+)
 from torchgco.dynamics import Dynamics
 from torchgco.judging.contact import contacts
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
@@ -47,12 +58,24 @@ def distance(shapes: Shapes, p: np.ndarray, t: float) -> np.ndarray:
 def test_every_kind_is_drawn_where_it_is() -> None:
     task, rng = problem(2), np.random.default_rng(1)
     for part in task.obstacles:
-        shapes = shapes_of(part, 1)
+        shapes = shapes_of(part, 1, 1.0)
         assert shapes is not None and len(shapes.center) == int((~part.absent[1]).sum())
         for p, t in zip(rng.uniform(-3, 9, (40, 3)), rng.uniform(0, 4, 40), strict=True):
             there = part.signed_distance(torch.from_numpy(p).expand(2, 1, 3), torch.tensor([t]).double())[1, 0]
             there = there[~part.absent[1]].numpy() + RADIUS
             np.testing.assert_allclose(distance(shapes, p, t), there, atol=1e-9)
+
+
+def test_what_swings_is_drawn_where_it_is() -> None:
+    rng, task = np.random.default_rng(5), problem(2)
+    boxes = Boxes(rng.uniform(0, 5, (2, 3)), [[0.3, 0.1, 0.2], [0.4, 0.4, 0.4]], RADIUS)
+    sines = (rng.uniform(low, high, (2, 2, 3)) for low, high in ((-1, 1), (-3, 3), (-3, 3)))
+    part = Problem(task.dynamics, task.cost, [OscillatingBoxes(boxes, *sines)], task.x0, N).obstacles[0]
+    shapes = shapes_of(part, 1, 20.0)
+    assert shapes is not None and shapes.track is not None
+    for p, t in zip(rng.uniform(-3, 9, (40, 3)), rng.uniform(0, 20, 40), strict=True):
+        there = part.signed_distance(torch.from_numpy(p).expand(2, 1, 3), torch.tensor([t]).double())[1, 0].numpy()
+        np.testing.assert_allclose(distance(shapes, p, t), there + RADIUS, atol=0.03)  # 0.5 % of swings up to 4 m
 
 
 @pytest.mark.parametrize("half", [None, [[0.3, 0.1, 0.0], [0.4, 0.4, 0.4]]])
@@ -61,7 +84,7 @@ def test_what_follows_a_track_is_drawn_where_it_is(half: list[list[float]] | Non
     path = rng.uniform(0, 5, (N + 1, 2, 3))
     task = Problem(task.dynamics, task.cost, [Moved(path, 0.2, RADIUS, half)], task.x0, N)
     part, bodies = task.obstacles[0], world_of(task, 1).scenes[0].bodies[0]
-    shapes = shapes_of(part, 1)
+    shapes = shapes_of(part, 1, 1.0)
     assert shapes is not None and len(bodies) == 2 and all(body.moving for body in bodies)
     for p, t in zip(rng.uniform(-3, 9, (40, 3)), rng.uniform(0, 5, 40), strict=True):
         there = part.signed_distance(torch.from_numpy(p).expand(2, 1, 3), torch.tensor([t]).double())[1, 0].numpy()
@@ -76,7 +99,7 @@ def test_turned_boxes_in_the_plane() -> None:
     cost = QuadraticCost(Q=[0.0] * 6, R=[1.0] * 2, Qf=[1.0] * 6, x_ref=[1.0, 0, 0, 0, 0, 0])
     boxes = Boxes([[0.5, 0.2], [0.1, 0.9]], [[0.3, 0.1], [0.2, 0.2]], 0.05, rotations=[0.7, -2.0], radii=[0.1, 0.0])
     task = Problem(Planar(), cost, [boxes], torch.zeros(1, 6, dtype=torch.float64), 5)
-    shapes = shapes_of(task.obstacles[0], 0)
+    shapes = shapes_of(task.obstacles[0], 0, 1.0)
     assert shapes is not None
     for p in np.random.default_rng(2).uniform(-1, 1, (20, 2)):
         there = task.obstacles[0].signed_distance(torch.from_numpy(p).view(1, 1, 2), torch.zeros(1))[0, 0].numpy()
@@ -108,10 +131,10 @@ def test_equal_rows_are_kept_once() -> None:
 def test_a_kind_that_is_added_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     part = problem(1).obstacles[1]
     other = RoundedBoxes(np.zeros((1, 3)), np.ones((1, 3)), np.eye(3)[None], np.zeros(1))
-    seen = shapes_of(part, 0)  # as the search for paths sees boxes
+    seen = shapes_of(part, 0, 1.0)  # as the search for paths sees boxes
     assert seen is not None and np.allclose(seen.half, part.half_sizes[0])  # type: ignore[attr-defined]
     monkeypatch.setattr(BoundBoxes, "shapes", lambda part, b: other)
-    drawn = shapes_of(part, 0)
+    drawn = shapes_of(part, 0, 1.0)
     assert drawn is not None and drawn.half is other.half and drawn.center is other.center
 
 
@@ -136,7 +159,7 @@ def test_cells_and_points_of_maps_are_drawn_where_they_are(batch: bool) -> None:
     cost = QuadraticCost(Q=[0.0] * 3, R=[1.0] * 3, Qf=[1.0] * 3, x_ref=[8.0, 0, 0])
 
     def drawn(source: OccupancyGrid | PointCloud) -> Shapes:
-        found = shapes_of(Problem(dynamics, cost, [Field(DistanceField.of(source), 0.1)], x0, 4).obstacles[0], 1)
+        found = shapes_of(Problem(dynamics, cost, [Field(DistanceField.of(source), 0.1)], x0, 4).obstacles[0], 1, 1.0)
         assert found is not None
         return found
 

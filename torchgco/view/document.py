@@ -213,11 +213,13 @@ class Document:
         goal = None if problem.goal is None else problem.goal.position[b].cpu().double().numpy()
         middle = start if goal is None else 0.5 * (start + goal)
         names = list(self.solvers)
+        knots = max([problem.N, *(len(flight.path) - 1 for flight in flights)])
+        duration = knots * self.dt if times is None else float(times[-1])
         content: dict[str, Any] = {
             "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
             "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
             "map": _extent(problem, b), "gates": outlines_of(problem, b),
-            "obstacles": [self._placed(packing, shape, middle) for shape in self._shapes(problem.obstacles, b)],
+            "obstacles": [self._placed(packing, one, middle) for one in self._shapes(problem.obstacles, b, duration)],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
             "times": None if times is None else packing.put(times, steps=True),
@@ -240,10 +242,10 @@ class Document:
         self.maps.setdefault(key, text)
         return {"shared": places.index(key) if key in places else len(places)}
 
-    def _shapes(self, obstacles: Sequence[Obstacles], b: int) -> list[Any]:
+    def _shapes(self, obstacles: Sequence[Obstacles], b: int, duration: float) -> list[Any]:
         drawn = []
         for core in (core.inscribed for core in obstacles):  # those of a body are the obstacles of each of its balls
-            shapes = shapes_of(core, b)
+            shapes = shapes_of(core, b, duration)
             if shapes is None:
                 note = f"not drawn: {type(core).__name__}"
                 self.notes += [] if note in self.notes else [note]

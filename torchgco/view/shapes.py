@@ -6,7 +6,8 @@ A kind of obstacles of your own says how it looks in `shapes`; without that it i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import ceil, pi
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchgco.maps.distance import Unknown
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import Obstacles
+from torchgco.obstacles.shapes import RoundedBoxes
 from torchgco.view.packing import Packing
 
 NOT_TURNED = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no turn
@@ -89,19 +91,36 @@ def _cells(grid: OccupancyGrid, cells: np.ndarray, unknown: Unknown | None = Non
     return Shapes(center, 0.5 * grid.resolution * (high - low), np.zeros(1), cells=True, unknown=unknown)
 
 
-def shapes_of(obstacles: Obstacles, b: int) -> Shapes | None:
-    """The obstacles of problem b, as one that is a ball meets them; None where nobody says how they look."""
+def shapes_of(obstacles: Obstacles, b: int, duration: float) -> Shapes | None:
+    """The obstacles of problem b, as one that is a ball meets them; None where nobody says how they look.
+
+    Args:
+        duration: s, for which those that swing follow their sines, but for 0.5 % of the swing.
+    """
     if obstacles.map is not None:
         return _map(obstacles.map, b)
     boxes = obstacles.shapes(b)
-    if boxes is None or boxes.sines is not None:
+    if boxes is None:
         return None
+    if boxes.sines is not None:
+        boxes = _sampled(boxes, duration)
     until = None if obstacles.stops is None else float(obstacles.stops[b]) * obstacles.dt
     half, turn = np.zeros((1, boxes.center.shape[1])), None
     if boxes.half.any():
         half, turn = boxes.half, turns(boxes.sides)
     motion = {"velocity": boxes.velocity, "until": until, "track": boxes.track, "step": boxes.step}
     return Shapes(boxes.center, half, boxes.radius, turn, **motion)
+
+
+def _sampled(boxes: RoundedBoxes, duration: float) -> RoundedBoxes:
+    """Boxes that swing, as boxes with a track, sampled 32 times in the shortest period."""
+    assert boxes.sines is not None
+    amplitudes, rates, phases = boxes.sines
+    fastest = np.abs(rates[amplitudes != 0]).max(initial=0.0)
+    count = max(1, ceil(duration * fastest * 32 / (2 * pi)))
+    t = np.linspace(0.0, duration, count + 1).reshape(-1, 1, 1, 1)
+    track = boxes.center + (amplitudes * np.sin(rates * t + phases)).sum(axis=2)
+    return replace(boxes, center=track[0], sines=None, track=track, step=duration / count)
 
 
 def turns(axes: np.ndarray) -> np.ndarray | None:

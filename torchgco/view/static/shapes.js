@@ -171,7 +171,7 @@ export function obstacles(parts, space, colours, still) {
   }
   const add = (...more) => {
     more.forEach((one) => (one.frustumCulled = false));
-    group.add(...more);
+    if (more.length) group.add(...more);
   };
   add(...meshes, ...unseen);
   const until = Math.min(...parts.map((part) => part.until ?? Infinity), Infinity);
