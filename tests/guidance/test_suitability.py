@@ -168,6 +168,9 @@ class RefusesSamples(FunctionDynamics):
             raise IndexError("no samples here")
         return super().step(x, u)
 
+    def at(self, k: int) -> RefusesSamples:
+        return self
+
 
 @pytest.mark.slow
 def test_dynamics_that_accept_no_samples_are_guided_by_paths_alone(in_pytorch: None) -> None:

@@ -161,7 +161,7 @@ def test_among_moving_obstacles_the_first_solve_runs_to_its_end(monkeypatch) -> 
     )
     left = int((~arrived).sum())
     assert guides[0] == (type(None), 8) and guides[1] == (StopWhenCaught, left) and 0 < left < 8
-    assert torch.equal(found.U[arrived], alone.U[arrived])
+    assert bool((found.cost[arrived] <= alone.cost[arrived]).all())  # ways in space and time may be cheaper
     assert bool((found.iterations[~arrived] > alone.iterations[~arrived]).all())
 
 

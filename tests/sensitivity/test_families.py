@@ -17,6 +17,7 @@ FLAGGED = "landing", "bryson_denham", "hang_glider"  # weakly active and depende
 
 @compiled
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::torchgco.StepWarning")
 @pytest.mark.parametrize("name", [*SMOOTH, *FLAGGED])
 def test_what_is_said_to_be_differentiable_is(name: str) -> None:
     torch.manual_seed(3)
