@@ -9,4 +9,4 @@ from torchgco.maps.distance import DistanceField as DistanceField
 from torchgco.maps.field import Field as Field
 from torchgco.maps.files import read as read
 from torchgco.maps.grid import OccupancyGrid as OccupancyGrid
-from torchgco.maps.points import PointCloud as PointCloud
+from torchgco.maps.grid import PointCloud as PointCloud

@@ -25,8 +25,7 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.carried import Carrying, Taken
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import QuadraticInFreeTime
-from torchgco.dynamics.base import WrappedDynamics
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS, WrappedDynamics
 from torchgco.problem.carried import carried_of, rows_of_one_knot
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem

@@ -20,8 +20,7 @@ from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.memory import free_memory
 from torchgco.base.options import check_value
 from torchgco.maps.distance import DistanceField
-from torchgco.maps.grid import OccupancyGrid
-from torchgco.maps.points import PointCloud
+from torchgco.maps.grid import OccupancyGrid, PointCloud
 from torchgco.scenarios import checks
 
 GRID = ("map_occupied", "map_origin", "map_resolution")

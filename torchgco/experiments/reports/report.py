@@ -19,12 +19,11 @@ import torch
 from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import say
+from torchgco.experiments.ending import RunParser, say
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT
 from torchgco.experiments.flying.progress import draw
 from torchgco.experiments.flying.progress import draw as draw_all
 from torchgco.experiments.flying.tasks import Tasks
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import (
@@ -37,11 +36,10 @@ from torchgco.experiments.results.folder import (
     TRIALS,
     read_trials,
 )
-from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
+from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, mission_lines, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.families import families_text, over_families
-from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.experiments.statistics.power import in_words
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
