@@ -23,8 +23,7 @@ from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.workers import Shared, cut, fly_all, trial_bar
 from torchgco.experiments.reports.explained import advised, explained, where_to_start
-from torchgco.experiments.reports.fleet_report import write_fleet_report
-from torchgco.experiments.reports.report import mission_table, write_mission_report, write_report
+from torchgco.experiments.reports.report import mission_table, write_fleet_report, write_mission_report, write_report
 from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.folder import COLUMNS, DONE, JUDGED, StudyFolder, with_success
