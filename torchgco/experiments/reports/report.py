@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
 from torchgco.experiments.ending import RunParser, say
+from torchgco.experiments.flying.flight import Tasks
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, VEHICLES, vehicles_table
 from torchgco.experiments.flying.progress import draw
-from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import (
