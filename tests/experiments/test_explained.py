@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import HOLD, TINY, problem_line
-from torchgco.experiments.reports import study
+from torchgco.experiments.flying import study
 
 
 @pytest.mark.slow
