@@ -1,4 +1,4 @@
-"""The numbers of a problem by name, new ones for them, and memory of their own for each."""
+"""The numbers of a problem by name, new ones and memory of their own for them, and their other form in a free time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Problems with a free time in the form that solvers work on, and the way back.
+"""Problems with a free time in the form that solvers work on, the way back, and trajectories as guesses a while later.
 
 The states are [x, tau, carried ones], the controls [u, next tau]: the first segment's factor tau is a
 free component of the start, the next one a control of the last stage before its segment, and everywhere else tau stays

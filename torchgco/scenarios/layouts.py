@@ -1,4 +1,4 @@
-"""Obstacle layouts, as scenarios draw them and layout files hold them.
+"""Obstacle layouts, as scenarios draw them and layout files hold them, with their map among the arrays.
 
 L layouts, M spheres and K boxes each, d the dimension of space (2 or 3). A layout with fewer of them is padded with
 rows of NaN. Lengths in metres, times in seconds.

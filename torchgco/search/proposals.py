@@ -1,4 +1,4 @@
-"""Proposals along paths: for each problem, the best of several trajectories that follow short paths past obstacles.
+"""Proposals along paths: for each problem the best of several trajectories past obstacles, and the record of it.
 
 A pass finds paths, one per homotopy class, or takes those that are known, and has candidates follow them. The
 candidates are relaxed: solved further without a guide, while a penalty keeps them out of the obstacles. The best are

@@ -1,4 +1,4 @@
-"""From a Hydra config to objects: the only place that instantiates."""
+"""From a Hydra config to objects: the only place that instantiates, and only what a study's files may make."""
 
 from __future__ import annotations
 

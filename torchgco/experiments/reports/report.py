@@ -1,4 +1,4 @@
-"""Reports on studies: tables, `summary.csv`, `paired.csv` and figures. `torchgco-report` is the command.
+"""Reports on studies, missions and fleets: tables, `summary.csv`, figures. `torchgco-report` is the command.
 
 `torchgco-report DIR [DIR ...]` merges every `trials.parquet` below the folders, and the shards of studies that still
 run, and reports on all of them together.

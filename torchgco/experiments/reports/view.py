@@ -1,4 +1,4 @@
-"""`torchgco-view RUN`: a page of a finished study, which one turns around; see docs/view.md."""
+"""`torchgco-view RUN`: a page of a finished study, and of some layouts their search, solved again; see docs/view.md."""
 
 from __future__ import annotations
 
