@@ -260,7 +260,7 @@ class System:
 
 
 class Solved(torch.autograd.Function):
-    """X, U, multipliers (B, R) and costs as functions of a `residual.Residual`'s parts."""
+    """X, U, multipliers (B, R) and costs as functions of a `Residual`'s parts."""
 
     @staticmethod
     def forward(
