@@ -33,9 +33,9 @@ from torchgco import Problem, presets
 from torchgco.constraints import Constraint
 from torchgco.experiments.config.build import compose_config
 from torchgco.experiments.dataset import command as dataset
+from torchgco.experiments.ending import RunParser
 from torchgco.experiments.referee import judge
 from torchgco.experiments.reports import export, identify, report, view
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.kernels import EagerWarning
 from torchgco.native import store
 from torchgco.native.compiler import find_compiler

@@ -10,9 +10,8 @@ from tests.problems import planar_batch, quick_gco
 from torchgco import Status
 from torchgco.base import clock
 from torchgco.experiments.config.build import compose
-from torchgco.experiments.flying.flight import SolveBatch
+from torchgco.experiments.flying.flight import SolveBatch, Tasks
 from torchgco.experiments.flying.progress import NoBar
-from torchgco.experiments.flying.tasks import Tasks
 from torchgco.kernels import choice
 from torchgco.native import compiler
 from torchgco.roadmap import native_maps

@@ -29,8 +29,7 @@ from torchgco.baselines import CasADiSolver, Hold
 from torchgco.constraints import Constraint
 from torchgco.dynamics.rollout import open_loop
 from torchgco.experiments.config.build import compose
-from torchgco.experiments.flying.flight import SolveBatch
-from torchgco.experiments.flying.tasks import Tasks
+from torchgco.experiments.flying.flight import SolveBatch, Tasks
 from torchgco.solvers.contracts import Call, Solver
 
 PLUGINS = ["ipopt", "fatrop"]

@@ -16,7 +16,7 @@ from tests.slow import mostly
 from torchgco import ControlBounds, FreeTime, FunctionDynamics, Problem, QuadraticCost, kernels
 from torchgco.base.autodiff import gradient_and_hessian, jacobian
 from torchgco.base.errors import InputError
-from torchgco.dynamics.integrators import IMPLICIT, INTEGRATORS
+from torchgco.dynamics.base import IMPLICIT, INTEGRATORS
 from torchgco.judging.steps import ORDER_OF
 from torchgco.native.compiler import find_compiler
 

@@ -7,12 +7,12 @@ import pandas as pd
 import pytest
 
 from tests.experiments.commands import HOLD, TINY, problem_line
-from torchgco.experiments.reports import explained
+from torchgco.experiments.flying import study
 
 
 @pytest.mark.slow
 def test_failed_layouts_are_explained_also_of_a_finished_study(run, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(explained, "EXPLAINED", 3)
+    monkeypatch.setattr(study, "EXPLAINED", 3)
     words = [*HOLD, "study.figures=false", "hydra.run.dir=out"]
     code, plain, _ = run(*words)
     assert code == 0 and "Why it ended" not in plain

@@ -20,7 +20,7 @@ from tests.trials import trials as hand_made
 from torchgco.experiments.flying import progress, workers
 from torchgco.experiments.reports import report
 from torchgco.experiments.reports.verify import verify
-from torchgco.experiments.statistics.missions import mission_lines
+from torchgco.experiments.results.kinds import mission_lines
 from torchgco.missions import RotorPlant
 from torchgco.plotting import missions as draw
 

@@ -4,14 +4,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from torchgco.experiments.reports.mission_view import _told
 
 from tests.trials import flights, manifest, missions, trials
 from torchgco.base.errors import InputError
+from torchgco.experiments.reports.finished import _told
 from torchgco.experiments.reports.report import main, write_report
-from torchgco.experiments.results.kinds import TRAJECTORIES, format_report, joined, parts_of
+from torchgco.experiments.results.kinds import TRAJECTORIES, format_report, joined, parts_of, summarise_missions
 from torchgco.experiments.results.merge import merge
-from torchgco.experiments.statistics.missions import summarise_missions
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
 from torchgco.scenarios.layouts import Layouts

@@ -11,9 +11,8 @@ import pytest
 
 from tests.experiments.commands import HOLD, problem_line
 from torchgco import InputError
-from torchgco.experiments.config.build import compose_config, mission_from, solver_from, vehicle_of
+from torchgco.experiments.config.build import check_stored, compose_config, mission_from, solver_from, vehicle_of
 from torchgco.experiments.config.groups import _tree
-from torchgco.experiments.config.stored import check_stored
 from torchgco.experiments.reports import report, view
 from torchgco.experiments.results.identity import digest
 from torchgco.presets import PRESETS

@@ -14,7 +14,7 @@ from torchgco import Boxes, Goal, OscillatingBoxes, Problem, QuadraticCost, cert
 from torchgco.base.errors import InputError
 from torchgco.exploration.sensing import World
 from torchgco.missions.contact import Contact
-from torchgco.obstacles.oscillating import BoundOscillatingBoxes
+from torchgco.obstacles.boxes import BoundOscillatingBoxes
 
 B, M, S, N, DT = 3, 4, 2, 6, 0.05
 

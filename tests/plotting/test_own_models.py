@@ -13,7 +13,7 @@ import torchgco
 from tests.trials import flights, trials
 from torchgco import Boxes, Ellipsoids, Moved
 from torchgco.dynamics import Dynamics, Unicycle
-from torchgco.experiments.flying.tasks import Tasks
+from torchgco.experiments.flying.flight import Tasks
 from torchgco.experiments.reports import report
 from torchgco.plotting.layouts import flights_of, layout_grid
 from torchgco.plotting.scene import scene_of

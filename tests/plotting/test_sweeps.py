@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from tests.trials import flights, missions, trials
-from torchgco.experiments.statistics.missions import summarise_missions
+from torchgco.experiments.results.kinds import summarise_missions
 from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting.rates import sweep_figure
 from torchgco.plotting.style import solver_colours

@@ -11,7 +11,7 @@ import torch
 from torchgco import Layouts, compose
 from torchgco.base.errors import InputError
 from torchgco.experiments.results.identity import layout_digests
-from torchgco.obstacles.oscillating import BoundOscillatingBoxes
+from torchgco.obstacles.boxes import BoundOscillatingBoxes
 from torchgco.scenarios import Trefoils, concatenate
 from torchgco.scenarios.layouts import SINES
 

@@ -1,4 +1,4 @@
-"""How a problem ended: one status per problem, each with a sentence."""
+"""How a problem ended, and whether its solution has derivatives: one status or reason per problem, with a sentence."""
 
 from __future__ import annotations
 

@@ -22,9 +22,17 @@ from torchgco.base.shapes import CPU, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.answer import Answer
-from torchgco.compiled.in_free_time import KeptInTime, kept_in_time, later, numbers_in_time
-from torchgco.compiled.numbers import Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
-from torchgco.constraints.integral import Integral
+from torchgco.compiled.numbers import (
+    KeptInTime,
+    Numbers,
+    kept_in_time,
+    later,
+    numbers_in_time,
+    numbers_of,
+    with_numbers_as_they_are,
+    with_own_numbers,
+)
+from torchgco.constraints.link import Integral
 from torchgco.explaining.explain import Account
 from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, served_by
 from torchgco.lagrangian.lagrangian import Multipliers

@@ -1,10 +1,11 @@
-"""The numbers of a problem by name, new ones for them, and memory of their own for each."""
+"""The numbers of a problem by name, new ones and memory of their own for them, and their other form in a free time."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,17 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.numbers import Floats, Number, numbers_of_fields
+from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers, numbers_of_fields
 from torchgco.base.tree import own_mapped
+from torchgco.kernels import cost_scale, cost_unit, current, interior_of
+from torchgco.lagrangian.barrier import BarrierOptions
+from torchgco.lagrangian.lagrangian import Multipliers
+from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.problem.goal import Goal, GoalBall, GoalState
+from torchgco.problem.in_time import Elapsed, factors_in, factors_of, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
+from torchgco.solution import Solution
+from torchgco.tracing import own_tensors
 
 
 class Numbers(Mapping[str, Floats]):
@@ -142,3 +150,166 @@ def _own(part: Any, B: int) -> Any:
         return value.expand(B, *value.shape[1:]).clone(memory_format=torch.contiguous_format)
 
     return own_mapped(part, each)
+
+
+class KeptInTime(Kept):
+    """Kept problems with a free time: in the form `in_time` and, as in solves with a choice of time, in units of cost.
+
+    Args:
+        kernels: of this form.
+        user: the problems, whose tensors are written to.
+        whole: the same `in_time`.
+        options: see `Kept`.
+    """
+
+    def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
+        self.user, self.whole, self.unit = user, whole, cost_unit(whole)
+        super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options)
+        self._given = user.x0.numpy()
+        pairs = zip(user.constraints, whole.constraints, strict=False)
+        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}
+
+    @property
+    def times(self) -> Tensor:
+        """Of the knots of `rolled`, (B, N+1), s."""
+        return times_of(self.user, factors_in(self.user, self.rolled[0]))
+
+    @property
+    def multipliers(self) -> tuple[Tensor, ...]:
+        """Copies of those of the user's rows, (B, K, p)."""
+        return tuple(self.unit.view(-1, 1, 1) * lam for lam in self.lam[: len(self.user.constraints)])
+
+    def copies(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """See `Kept`: those of the user's states and controls."""
+        (X, U, K, status, iterations), n, m = super().copies(), self.user.n, self.user.m
+        return X[..., :n].contiguous(), U[..., :m].contiguous(), K[..., :m, :n].contiguous(), status, iterations
+
+    def start(self) -> None:
+        """See `Kept`; the factors of time stay as they are."""
+        n, first = self.user.n, self._moving[0][:, 0]
+        self._x0[:, :n] = first[:, :n] = self._given
+        first[:, n + 1 :] = self._x0[:, n + 1 :]
+
+    def shift(self, by: float) -> None:
+        """Let all trajectories and multipliers begin `by` seconds later; see `Elapsed`."""
+        if by == 0:
+            return
+        user, count = self.user, len(self.user.constraints)
+        factors = factors_in(user, self.X)
+        span = Elapsed.of(user, factors, by)
+        X = span.states(self.X[..., : user.n])
+        U = span.controls(self.U[..., : user.m], times_of(user, factors).diff(dim=1))
+        lam = span.multipliers(self.lam[:count], self._knots[2 : 2 + count])
+        for z, new in zip((self.X, self.U, *self.lam), (*states_in_time(user, X, U, span.factors), *lam), strict=False):
+            z.copy_(new)
+
+    def take_over(self, rows: Tensor, solution: Solution) -> None:
+        """See `Kept`."""
+        user = self.user.take(rows)
+        assert solution.times is not None
+        self.X[rows], self.U[rows] = states_in_time(user, solution.X, solution.U, factors_of(user, solution.times))
+        for lam in self.lam:
+            lam[rows] = 0.0
+        for lam, solved in zip(self.lam, solution.multipliers.scaled(1.0 / self.unit[rows]).lam, strict=False):
+            lam[rows] = solved
+
+    def read(self, changed: set[str | int], now: Problem) -> set[str | int]:
+        """Put numbers of the user's parts that have changed where the form `in_time` has copies of them.
+
+        Args:
+            now: the user's problems with their numbers as they are.
+
+        Returns:
+            the parts whose numbers C has to read again.
+        """
+        places = sorted(self._copied_parts.intersection(changed))
+        if not places and "time" not in changed:
+            return changed
+        new, n = in_time(now), self.user.n
+        self._x0[:, n + 1 :] = new.x0[:, n + 1 :].numpy()  # controls before
+        if "time" in changed:
+            _copy(self.whole.cost, new.cost)
+            places += range(len(self.user.constraints), len(new.constraints))
+            changed = changed.union({"cost"}, places)
+        for i in places:
+            _copy(self.whole.constraints[i], new.constraints[i])
+        return changed
+
+
+def kept_in_time(problem: Problem, options: BarrierOptions) -> KeptInTime | None:
+    """Problems with a free time, packed; None where C can't serve them.
+
+    Args:
+        options: see `Kept`.
+    """
+    whole = current(in_time(problem))
+    kernels = interior_of(whole)
+    if not isinstance(kernels, InteriorEngine) or kernels.engine.captured.reads_own:
+        return None
+    return KeptInTime(kernels, problem, whole, options)
+
+
+def numbers_in_time(by_problem: list[Number], problem: Problem) -> list[Number]:
+    """The numbers of a problem with a free time: those of the problem, of the time, and checks of what is by stage."""
+    time = problem.time
+    assert time is not None
+    by_stage = problem.cost.names_by_stage()
+    for number in by_problem:
+        if number.part == "cost" and number.name.rpartition(".")[2] in by_stage:
+            number.check = partial(_steady, number, problem.N, number.check)
+    tensors = {name: getattr(time, name) for name in ("least", "most", "weight", "guess")}
+    fields = {
+        name: (tensor, at_least_zero if name == "weight" else above_zero)
+        for name, tensor in tensors.items()
+        if tensor is not None
+    }
+    views = {name: tensor.numpy() for name, (tensor, _) in fields.items()}
+    return by_problem + numbers("time", fields, "time", joint=partial(_crossed, views))
+
+
+def later(problem: Problem, last: Solution, shift: float) -> Solution:
+    """A guess for a horizon that begins so many stages, or seconds, later."""
+    if problem.time is not None:
+        return _later_in_time(problem, last, shift)
+    return last.shifted(shift) if shift else last
+
+
+def _later_in_time(problem: Problem, last: Solution, seconds: float) -> Solution:
+    """A guess for problems with a free time, so many seconds after the solution `last` began."""
+    assert last.times is not None
+    factors, knots = factors_of(problem, last.times), torch.arange(problem.N + 1)
+    elapsed = Elapsed.of(problem, factors, seconds)
+    rows = [knots[constraint.knots].tolist() for constraint in problem.constraints]
+    lam = elapsed.multipliers(last.multipliers.lam, rows)
+    X, U = elapsed.states(last.X), elapsed.controls(last.U, last.times.diff(dim=1))
+    multipliers = Multipliers(lam, last.multipliers.mu)
+    return replace(last, X=X, U=U, multipliers=multipliers, times=times_of(problem, elapsed.factors), needed=None)
+
+
+def _differ(users: Any, lifted: Any) -> bool:
+    """Whether a part has numbers that its form in free time has copies of."""
+    there = {tensor.data_ptr() for tensor in own_tensors(lifted)}
+    return any(tensor.data_ptr() not in there for tensor in own_tensors(users))
+
+
+def _copy(old: Any, new: Any) -> None:
+    for there, here in zip(own_tensors(old), own_tensors(new), strict=True):
+        if there.data_ptr() != here.data_ptr():
+            there.copy_(here)
+
+
+def _steady(number: Number, N: int, check: Any, new: Floats) -> Wrong:
+    """What is wrong with numbers by stage, which are the same at all stages where the time is free."""
+    rows = np.moveaxis(new, new.ndim - len(number.shape) + 1, 0)[:N]
+    if len(rows) > 1 and not (rows == rows[0]).all():
+        return "the same at all stages, as when it was compiled, where the time is free", "others"
+    return check(new)  # type: ignore[no-any-return]
+
+
+def _crossed(views: dict[str, Floats], new: Any) -> Wrong:
+    times = {name: new.get(f"time.{name}", view) for name, view in views.items()}
+    inner: Sequence[Floats] = [times["guess"]] if "guess" in times else []
+    for low, high in zip([times["least"], *inner], [*inner, times["most"]], strict=True):
+        if (low > high).any():
+            return "time.least at most time.guess and time.most", f"{low[low > high][0]:g} and {high[low > high][0]:g}"
+    return None

@@ -12,7 +12,7 @@ from torchgco.constraints.bounds import ControlBounds as ControlBounds
 from torchgco.constraints.bounds import RateBounds as RateBounds
 from torchgco.constraints.bounds import StateBounds as StateBounds
 from torchgco.constraints.gates import Gates as Gates
-from torchgco.constraints.integral import Integral as Integral
+from torchgco.constraints.link import Integral as Integral
 from torchgco.constraints.link import Link as Link
 from torchgco.constraints.norms import Cone as Cone
 from torchgco.constraints.norms import NormBounds as NormBounds

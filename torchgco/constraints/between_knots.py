@@ -13,7 +13,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS
 
 MOST_POINTS = 32  # of a stage: each has rows of its own
 # Instants at which rows of a stage are measured, its ends included, closer to these. A parabola through three of them

@@ -1,4 +1,4 @@
-"""Cost of a trajectory, and its quadratic expansion. A user's own cost is a subclass of `Cost`."""
+"""Cost of a trajectory, and its quadratic expansion. An own cost is a subclass of `Cost`, or functions."""
 
 from __future__ import annotations
 

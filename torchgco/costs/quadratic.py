@@ -1,4 +1,4 @@
-"""The quadratic cost of the paper, with linear and cross terms (section 2 of the method).
+"""The quadratic cost of the paper, with linear and cross terms (section 2 of the method), in a free time, too.
 
 All stages last the same multiple tau of dt, so knot k is at k dt tau, where a reference that is given at the nominal
 times j dt is between two of its rows. A natural cubic spline through all of them is what solvers need: its second

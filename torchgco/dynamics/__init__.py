@@ -1,7 +1,8 @@
 """Models of vehicles and the integrators that turn their vector fields into steps.
 
-`base.Dynamics` is what a model must say: sizes, a time step, and `field` or `step`. Models of one file each follow
-it; `rollout` steps through a horizon, `names` call states and controls. It imports `base`. Begin with `base.py`.
+`base.Dynamics` is what a model must say: sizes, a time step, and `field` or `step`. Models of vehicles follow it,
+those in the plane in `planar`; `rollout` steps through a horizon, `names` call states and controls. It imports
+`base`. Begin with `base.py`.
 """
 
 from torchgco.dynamics.base import Dynamics as Dynamics

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torchgco.base.options import Above, Seconds
 from torchgco.base.shapes import components, lead, vectors
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.integrators import Integrator
+from torchgco.dynamics.base import Dynamics, Integrator
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, Meters, NonNegative, Positive, Seconds, check_options
 from torchgco.base.shapes import components, lead, vectors
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.integrators import Integrator
+from torchgco.dynamics.base import Dynamics, Integrator
 
 Components = tuple[Tensor, ...]
 Triple = tuple[float, float, float]

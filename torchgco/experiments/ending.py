@@ -1,14 +1,16 @@
-"""How the commands `torchgco` and `torchgco-report` end: exit codes, Ctrl-C and SIGTERM, output that nobody reads."""
+"""How commands begin and end: the folder of a run, exit codes, Ctrl-C and SIGTERM, output that nobody reads."""
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import NoReturn
 
 from torchgco.base.errors import InputError
 from torchgco.base.signals import handled
@@ -107,3 +109,23 @@ def silence() -> None:
     Otherwise Python would complain when it ends.
     """
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+TRUST = "admit any size in a run's files, and any class, such as a model of yours: its code runs"
+
+
+class RunParser(argparse.ArgumentParser):
+    """Takes `--trust` where files are read, and shows no usage before an error: one line for every mistake."""
+
+    def __init__(self, prog: str, description: str, takes: str = "RUN", trusts: bool = True) -> None:
+        super().__init__(prog=prog, description=description)
+        self.takes = takes
+        if trusts:
+            self.add_argument("--trust", action="store_true", help=TRUST)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError("command line", f"{self.takes} and the options of --help", message)
+
+    def run(self, arguments: Sequence[str] | None, work: Callable[[argparse.Namespace], int]) -> int:
+        """Do the work of the program with its options; returns the exit code, see `ended`."""
+        return ended(self.prog, lambda: work(self.parse_intermixed_args(arguments)))

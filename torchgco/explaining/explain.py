@@ -1,4 +1,4 @@
-"""What happened to one problem of a batch, in words: the text of `Solution.explain`."""
+"""What happened to one problem of a batch, in words (`Solution.explain`), and what a solution keeps to be explained."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Missions in space that the vehicle has not seen: sensors, its map, paths on it, plans that stop where it is free.
 
-`mission.SensorMission` is a mission whose `explorer` knows only what `sensing` has seen; `scout` seeks ways on that
+`mission.SensorMission` is a mission whose `explorer` knows only what `sensing` has seen; a `Scout` seeks ways on that
 map, `safety` keeps a plan that stops. It imports `missions` and `roadmap`. Begin with `explorer.py`.
 """
 

@@ -1,4 +1,4 @@
-"""How missions are flown in space that the vehicle hasn't seen: options, and the planning problems of a period."""
+"""How missions fly in unknown space: options, what the vehicle knows, the path it seeks, the problems of a period."""
 
 from __future__ import annotations
 

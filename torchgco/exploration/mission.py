@@ -1,4 +1,4 @@
-"""Missions that learn of obstacles by a sensor.
+"""Missions that learn of obstacles by a sensor, and what the vehicle saw and sought, found again from its flight.
 
 Scans depend on the true world, the vehicle's states and the keys of all draws alone, and searches on the map and the
 measured states: a log need not hold what it can be found again from. Plans are not made again.

@@ -11,8 +11,8 @@ import torch
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.compiled import Compiled, compile
-from torchgco.compiled.in_free_time import KeptInTime
 from torchgco.compiled.motion import Motion
+from torchgco.compiled.numbers import KeptInTime
 from torchgco.constraints.norms import within_norms
 from torchgco.export.files import Build, Exported, write_files
 from torchgco.export.numbers import changing

@@ -1,4 +1,4 @@
-"""Guidance by constraint optimisation: the paper's plug-in of the outer loop (Algorithm 4).
+"""Guidance by constraint optimisation: the paper's plug-in of the outer loop (Algorithm 4), and which problems suit it.
 
 MPPI evaluates a problem in forms that the solver itself never needs: many samples at a time, in single precision. A
 user's own functions may fail there. Then the sampler falls back to the problem's own precision, or is left out.

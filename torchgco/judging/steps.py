@@ -17,7 +17,7 @@ from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users
 from torchgco.costs.base import Cost
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS
 from torchgco.problem.horizons import at_rest_after, within_horizons
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem

@@ -1,7 +1,7 @@
 """What solvers compute with: in PyTorch (`in_pytorch.Kernels`) and in C, chosen once per form of problems.
 
 Solvers call the functions of `verbs`, which ask `choice.kernels_of` whose they are. `in_c` hands a problem to
-`native`; where its code can't be traced, a warning names it, and `in_pytorch` computes the same. `elsewhere` brings
+`native`; where its code can't be traced, a warning names it, and `in_pytorch` computes the same. `choice` brings
 problems of a GPU to the CPU, and has their loops run on the GPU. It imports `native` and `eager`. Begin with
 `in_pytorch.py`, which says what kernels are asked.
 """

@@ -14,9 +14,8 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.notices import AFTER
 from torchgco.base.options import check_value
-from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.grid import OccupancyGrid, PointCloud
 from torchgco.maps.lookup import Lattice, lengths, squares
-from torchgco.maps.points import PointCloud
 
 FINE_NODES = 2**23  # nodes, at most, of fields with two nodes per cell and axis where `refine` doesn't say
 FIELD_NODES, OF_CLOUDS = 2**30, 2**26  # of one field, and of one over clouds, whose distances are looked up one by one

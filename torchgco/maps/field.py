@@ -15,10 +15,9 @@ from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions
 from torchgco.constraints.base import Constraint, Lowered, resolve_knots
 from torchgco.maps.distance import ALL_FREE, DistanceField
-from torchgco.maps.grid import OccupancyGrid
+from torchgco.maps.grid import OccupancyGrid, PointCloud
 from torchgco.maps.lookup import Lattice, lengths, squares, squares_and_slopes
 from torchgco.maps.measured import segment_distances
-from torchgco.maps.points import PointCloud
 from torchgco.obstacles.base import ABSENT, ADMITTED, BOUND_SLACK, CONTACT_FACTOR, TOUCH, OwnKind, least
 from torchgco.obstacles.inputs import dimension, is_body, vehicle_radii
 from torchgco.obstacles.measured import Distances

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation  # before drone_models, which would
 from torch import Tensor
 
 from torchgco.base.extras import imported
-from torchgco.dynamics.integrators import rk4
+from torchgco.dynamics.base import rk4
 from torchgco.dynamics.quadrotor import Airframe, within_limits
 from torchgco.missions.plant import RotorPlant, column
 

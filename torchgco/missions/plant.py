@@ -11,7 +11,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import Seconds, check_options
 from torchgco.base.tree import PerElement, Rows
-from torchgco.dynamics.integrators import rk4
+from torchgco.dynamics.base import rk4
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlant, within_limits
 
 

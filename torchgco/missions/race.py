@@ -20,8 +20,7 @@ from torchgco.base.options import Checked, Count, Meters, NonNegative, Within
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.constraints.gates import GateBalls, Gates, gates_of
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.integrators import rk4
+from torchgco.dynamics.base import Dynamics, rk4
 from torchgco.dynamics.quadrotor import QuadrotorThrusts, with_unit_quaternion
 from torchgco.missions.contact import Passing
 from torchgco.missions.log import SeenLog

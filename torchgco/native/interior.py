@@ -1,4 +1,4 @@
-"""The interior point in C: its library for a form of problems, and the options that it reads."""
+"""The interior point in C: its library for a form of problems, its options, and problems that stay packed."""
 
 from __future__ import annotations
 

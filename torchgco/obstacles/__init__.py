@@ -11,8 +11,8 @@ from torchgco.obstacles.base import CONTACT_FACTOR as CONTACT_FACTOR
 from torchgco.obstacles.base import Obstacles as Obstacles
 from torchgco.obstacles.body import Body as Body
 from torchgco.obstacles.boxes import Boxes as Boxes
+from torchgco.obstacles.boxes import OscillatingBoxes as OscillatingBoxes
 from torchgco.obstacles.capsules import Capsules as Capsules
 from torchgco.obstacles.ellipsoids import Ellipsoids as Ellipsoids
 from torchgco.obstacles.moved import Moved as Moved
-from torchgco.obstacles.oscillating import OscillatingBoxes as OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres as Spheres

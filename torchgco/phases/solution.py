@@ -1,4 +1,4 @@
-"""What is found for phases: a solution of each, what only all together have, and what the judge makes of them."""
+"""What is found for phases, and how: a solution of each, what all together have, and what the judge makes of it."""
 
 from __future__ import annotations
 

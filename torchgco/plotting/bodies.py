@@ -1,4 +1,4 @@
-"""Obstacles as a map shows them: seen along an axis or cut by a plane, also grown by the vehicle's radius."""
+"""Obstacles, and a vehicle's body of balls, as a map shows them: seen along an axis or cut by a plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layouts in the form that a map shows, and what a map asks of flights through them."""
+"""Layouts and problems in the form that a map shows, and what a map asks of flights through them."""
 
 from __future__ import annotations
 

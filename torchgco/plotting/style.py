@@ -1,4 +1,4 @@
-"""Shared by all figures: a colour per solver, panels, axes, and saving.
+"""Shared by all figures: a colour per solver, panels, axes, grids of maps, and saving.
 
 Figures are plain `matplotlib.figure.Figure` objects without pyplot, so that no window system and no global
 state is touched, and a figure is freed when nothing refers to it.

@@ -23,8 +23,7 @@ from torchgco.base.values import asks_for_knot, whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost, FunctionCost
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.integrators import Integrator
+from torchgco.dynamics.base import Dynamics, Integrator
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
 

@@ -1,4 +1,4 @@
-"""Problems with a free time in the form that solvers work on, and the way back.
+"""Problems with a free time in the form that solvers work on, the way back, and trajectories as guesses a while later.
 
 The states are [x, tau, carried ones], the controls [u, next tau]: the first segment's factor tau is a
 free component of the start, the next one a control of the last stage before its segment, and everywhere else tau stays
@@ -25,8 +25,7 @@ from torchgco.constraints.bounds import ControlBounds, StateBounds
 from torchgco.constraints.carried import Carrying, Taken
 from torchgco.costs.base import Cost, WrappedCost
 from torchgco.costs.quadratic import QuadraticInFreeTime
-from torchgco.dynamics.base import WrappedDynamics
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS, WrappedDynamics
 from torchgco.problem.carried import carried_of, rows_of_one_knot
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.problem import Problem

@@ -12,8 +12,7 @@ from torch import Tensor
 from torchgco.base.autodiff import slope_along
 from torchgco.base.errors import InputError
 from torchgco.base.values import Values
-from torchgco.dynamics.base import Dynamics, FunctionDynamics
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS, Dynamics, FunctionDynamics
 from torchgco.dynamics.names import Quantity, controls_of, states_of
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem

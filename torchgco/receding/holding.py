@@ -16,8 +16,7 @@ from torch import Tensor
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import bounds_of, rates_of
 from torchgco.constraints.norms import within_norms
-from torchgco.dynamics.base import Dynamics
-from torchgco.dynamics.integrators import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS, Dynamics
 from torchgco.kernels import current, followed, measured, open_loop, path_clearance
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival, violation
 from torchgco.obstacles.base import ADMITTED

@@ -92,7 +92,7 @@ class Plan:
     def at(self, t: float, x: Any = None) -> Instant:
         """States (B, n) and controls (B, m) at a time, s.
 
-        Controls are those of their stage, states are integrated from the knot before (`problem.between`). Before its
+        Controls are those of their stage, states are integrated from the knot before (`times.between`). Before its
         start a plan is at its first knot; after its end at its last one, with its last control.
 
         Args:

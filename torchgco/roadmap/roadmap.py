@@ -1,4 +1,4 @@
-"""Short paths between spheres and boxes over a graph of points: geometry alone, without time or controls.
+"""Short paths between spheres and boxes over a graph of points, leg by leg through gates; searches can go on.
 
 Points lie around every obstacle, midway between neighbours and, in a fixed low-discrepancy sequence, all over the
 scene; each is joined to a few near ones where the straight line is free. Nothing is random. C searches (c/cheapest.c),

@@ -1,4 +1,4 @@
-"""Obstacle layouts, as scenarios draw them and layout files hold them.
+"""Obstacle layouts, as scenarios draw them and layout files hold them, with their map among the arrays.
 
 L layouts, M spheres and K boxes each, d the dimension of space (2 or 3). A layout with fewer of them is padded with
 rows of NaN. Lengths in metres, times in seconds.
@@ -20,8 +20,7 @@ from torchgco.base.files import read_arrays, write_whole
 from torchgco.base.memory import free_memory
 from torchgco.base.options import check_value
 from torchgco.maps.distance import DistanceField
-from torchgco.maps.grid import OccupancyGrid
-from torchgco.maps.points import PointCloud
+from torchgco.maps.grid import OccupancyGrid, PointCloud
 from torchgco.scenarios import checks
 
 GRID = ("map_occupied", "map_origin", "map_resolution")

@@ -23,8 +23,7 @@ from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.quadrotor import Airframe, QuadrotorPlanning
 from torchgco.maps.field import Field
 from torchgco.obstacles.body import Body
-from torchgco.obstacles.boxes import Boxes
-from torchgco.obstacles.oscillating import OscillatingBoxes
+from torchgco.obstacles.boxes import Boxes, OscillatingBoxes
 from torchgco.obstacles.spheres import Spheres
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal

@@ -1,4 +1,4 @@
-"""Proposals along paths: for each problem, the best of several trajectories that follow short paths past obstacles.
+"""Proposals along paths: for each problem the best of several trajectories past obstacles, and the record of it.
 
 A pass finds paths, one per homotopy class, or takes those that are known, and has candidates follow them. The
 candidates are relaxed: solved further without a guide, while a penalty keeps them out of the obstacles. The best are
@@ -291,7 +291,7 @@ class Part:
 
     @cached_property
     def scales(self) -> tuple[Tensor, Tensor]:
-        """R and q0 / R^4 (B,); see `scene.scales`."""
+        """R and q0 / R^4 (B,); see `geometry.scales`."""
         assert self.scene is not None
         return seen.scales(self.problem, self.scene, self.rest)
 
@@ -315,7 +315,7 @@ class Part:
         return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
-        """Record a comparison for the problems in `rows`; see `record.comparison`."""
+        """Record a comparison for the problems in `rows`; see `comparison`."""
         assert self.record is not None
         number = self.record.passes[-1][0]
         self.record.comparisons.append(comparison(number, self.places[rows], paths, refine, *steps))

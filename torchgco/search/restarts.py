@@ -1,4 +1,4 @@
-"""The default solver: AL-iLQR, and where it is caught between obstacles, the passes of a table, row by row."""
+"""The default solver: AL-iLQR, and where it is caught between obstacles, the passes of a table that suit a problem."""
 
 from __future__ import annotations
 

@@ -23,8 +23,7 @@ from torchgco.search.table import Row
 from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEnd
-from torchgco.solvers.ending import fails_between
-from torchgco.solvers.history import Recorder
+from torchgco.solvers.ending import Recorder, fails_between
 from torchgco.solvers.interior import InteriorPoint
 
 

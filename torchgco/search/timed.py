@@ -1,4 +1,4 @@
-"""Problems among obstacles that move, solved from ways through a lattice in space and time.
+"""Problems among obstacles that move, solved from guesses along ways through a lattice in space and time.
 
 A solve from the guess alone mostly waits before what passes: waiting is a minimum there. Each way waits, or hurries, in
 a manner of its own, and the interior point starts close to it.

@@ -1,8 +1,7 @@
 """Derivatives of solutions with respect to everything that a problem is made of.
 
-`attach` joins a solution to the tensors that a problem was made of, `points` and `residual` are the conditions whose
-implicit derivative this is, `predict` a first-order guess at other numbers. It imports `solvers`. Begin with
-`attach.py`.
+`attach` joins a solution to the tensors that a problem was made of, and predicts it at other numbers to first order;
+`points` are the conditions whose implicit derivative this is. It imports `solvers`. Begin with `attach.py`.
 """
 
 from torchgco.sensitivity.attach import asks_for_gradients as asks_for_gradients

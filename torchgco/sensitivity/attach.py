@@ -28,8 +28,7 @@ from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import factors_in, factors_of, states_in_time, times_of
 from torchgco.problem.problem import Problem, current_problem
-from torchgco.sensitivity.function import Solved, System
-from torchgco.sensitivity.points import Points, gains_of, points_of
+from torchgco.sensitivity.points import Points, Solved, System, gains_of, points_of
 from torchgco.solution import Solution
 from torchgco.solvers.ending import judged_between
 from torchgco.solvers.timing import lifted_multipliers

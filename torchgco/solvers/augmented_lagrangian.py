@@ -31,8 +31,7 @@ from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.caught import StopWhenCaught
 from torchgco.solvers.contracts import Advice, Call, Guidance, Progress, Solver
-from torchgco.solvers.ending import start_status
-from torchgco.solvers.history import Recorder
+from torchgco.solvers.ending import Recorder, start_status
 from torchgco.solvers.ilqr import ILQR
 from torchgco.solvers.session import Session
 

@@ -1,4 +1,4 @@
-"""A primal-dual interior point on multiple shooting: constrained problems to a tight tolerance, from any guess."""
+"""A primal-dual interior point on multiple shooting, tight from any guess, and which violations no step lowers."""
 
 from __future__ import annotations
 

@@ -17,8 +17,7 @@ from torchgco.lagrangian.quality import violation
 from torchgco.problem.covered import covered_goals
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
-from torchgco.solvers.ending import Optimality, final_status, optimality
-from torchgco.solvers.history import Recorder
+from torchgco.solvers.ending import Optimality, Recorder, final_status, optimality
 from torchgco.solvers.unbounded import falls_without_end
 
 # Where a required goal is covered by an obstacle, the reason is known; these say only how the solve came to its end.

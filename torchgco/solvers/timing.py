@@ -31,7 +31,7 @@ from torchgco.problem.in_time import at_held_times, factors_in, fitting_factors,
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.convexity import KNOTS, STREAM, controls_of, looks_convex
-from torchgco.solvers.history import appended, in_units
+from torchgco.solvers.ending import appended, in_units
 from torchgco.solvers.straight import Legs, LinearTime, straight_line
 
 HELD_FIRST = 1.5  # the first time that is held, as a multiple of an estimate

@@ -1,4 +1,4 @@
-"""What a page shows: layouts, each with its obstacles and the trajectories flown through it."""
+"""What a page shows: layouts with obstacles and trajectories, and what these violate or touch at which place."""
 
 from __future__ import annotations
 

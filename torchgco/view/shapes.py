@@ -14,8 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from torchgco.maps.distance import Unknown
-from torchgco.maps.grid import OccupancyGrid
-from torchgco.maps.points import PointCloud
+from torchgco.maps.grid import OccupancyGrid, PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.shapes import RoundedBoxes
 from torchgco.view.packing import Packing

@@ -1,1 +1,1 @@
-"""Data sets of solved trajectories: `command` makes them, `rows` writes and reads them, `card` says what they hold."""
+"""Data sets of solved trajectories: `command` makes them, `rows` writes and reads them, and says what they hold."""

@@ -22,12 +22,10 @@ from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import DEFAULT_LAYOUTS, Setup, compose
 from torchgco.experiments.config.checks import check_once
 from torchgco.experiments.dataset.rows import ABOUT, MAP, files_of, rows_of, write_card
-from torchgco.experiments.ending import say
-from torchgco.experiments.flying.flight import Batch, Flown, Schedule, SolveBatch, check_time, plan_of
+from torchgco.experiments.ending import RunParser, say
+from torchgco.experiments.flying.flight import Batch, Flown, Schedule, SolveBatch, Tasks, check_time, plan_of
 from torchgco.experiments.flying.metrics import check_metrics
-from torchgco.experiments.flying.tasks import Tasks
 from torchgco.experiments.flying.workers import Shared, cut, fly_all, trial_bar
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import checksum, create, damaged, readable, write
 from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive, difference, layout_digests, settings_of

@@ -42,7 +42,7 @@ class MissionBatch(Batch):
     plans: bool = False  # keep the planned positions, for figures
 
     def fly(self) -> tuple[pd.DataFrame, np.ndarray]:
-        """Rows (without success), and logs (L, K, W) as `flights.packed` has them, NaN after a mission's end."""
+        """Rows (without success), and logs (L, K, W) as `outcome.packed` has them, NaN after a mission's end."""
         setup, layouts = self.setup, self.layouts
         assert setup.mission is not None
         mission = replace(setup.mission, planner=replace(setup.mission.planner, solver=self.solver))

@@ -1,4 +1,4 @@
-"""What the referee found as tables of a page: judged controls, and a leaderboard of entries."""
+"""What the referee found: controls judged and certified as rows, their page, and a leaderboard of entries."""
 
 from __future__ import annotations
 

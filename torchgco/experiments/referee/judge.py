@@ -10,9 +10,8 @@ from pathlib import Path
 import pandas as pd
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import say
+from torchgco.experiments.ending import RunParser, say
 from torchgco.experiments.referee.board import Leaderboard, Scene, judged_page, leaderboard
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import MANIFEST, TRIALS
 from torchgco.experiments.results.kinds import format_report, parts_of, write_tables

@@ -18,10 +18,9 @@ from torchgco.base.options import Positive, check_value
 from torchgco.dynamics import QuadrotorPlant
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.experiments.config.build import compose
-from torchgco.experiments.ending import say
+from torchgco.experiments.ending import RunParser, say
 from torchgco.experiments.reports.bags import Storage, write_bag
 from torchgco.experiments.reports.finished import Study
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results import durations
 from torchgco.experiments.results.files import write
 from torchgco.experiments.statistics.statistics import PAIR, swept_columns

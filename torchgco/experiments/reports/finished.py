@@ -1,4 +1,4 @@
-"""A finished study, as its page reads it."""
+"""A finished study as its page reads it: what was flown, and missions with tracks, plans and what a sensor saw."""
 
 from __future__ import annotations
 

@@ -16,9 +16,8 @@ from torchgco.base.version import VERSION
 from torchgco.dynamics.quadrotor import Airframe
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.config.checks import NAME_PATTERN
-from torchgco.experiments.ending import say
+from torchgco.experiments.ending import RunParser, say
 from torchgco.experiments.reports.finished import Study
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.files import readable, write
 from torchgco.experiments.results.folder import TIME_STEPS
 from torchgco.experiments.results.limits import read_table

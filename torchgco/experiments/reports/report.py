@@ -1,4 +1,4 @@
-"""Reports on studies: tables, `summary.csv`, `paired.csv` and figures. `torchgco-report` is the command.
+"""Reports on studies, missions and fleets: tables, `summary.csv`, figures. `torchgco-report` is the command.
 
 `torchgco-report DIR [DIR ...]` merges every `trials.parquet` below the folders, and the shards of studies that still
 run, and reports on all of them together.
@@ -19,12 +19,10 @@ import torch
 from matplotlib.figure import Figure
 
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import say
-from torchgco.experiments.flying.mission_flight import PLANS_KEPT
+from torchgco.experiments.ending import RunParser, say
+from torchgco.experiments.flying.flight import Tasks
+from torchgco.experiments.flying.mission_flight import PLANS_KEPT, VEHICLES, vehicles_table
 from torchgco.experiments.flying.progress import draw
-from torchgco.experiments.flying.progress import draw as draw_all
-from torchgco.experiments.flying.tasks import Tasks
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.reports.verify import confirmed_frame, confirmed_text, difference_texts, verify
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import (
@@ -37,31 +35,31 @@ from torchgco.experiments.results.folder import (
     TRIALS,
     read_trials,
 )
-from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, parts_of, write_tables
+from torchgco.experiments.results.kinds import MISSIONS, Part, format_report, mission_lines, parts_of, write_tables
 from torchgco.experiments.results.merge import REPEATED, UNFINISHED, merge
 from torchgco.experiments.results.runs import is_merged
 from torchgco.experiments.statistics.families import families_text, over_families
-from torchgco.experiments.statistics.missions import mission_lines
 from torchgco.experiments.statistics.power import in_words
 from torchgco.experiments.statistics.statistics import TASK, plain, task_columns
 from torchgco.experiments.statistics.tables import OUTPUTS, csv_text, format_frame
+from torchgco.fleets.drawn import solution_of
 from torchgco.missions.contact import Contact, Passing
 from torchgco.missions.outcome import clearances, gates_passed, mission_frame, time_step_frame, unpacked
 from torchgco.missions.planning_problem import airframe_of
 from torchgco.obstacles.base import Obstacles
-from torchgco.plotting import missions as figures
+from torchgco.plotting import missions as of_missions
 from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.bodies import bodies, body_of
 from torchgco.plotting.course import Course
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.families import families_figure
+from torchgco.plotting.fleets import fleet_animation, fleet_figure
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.layouts import layout_grid
-from torchgco.plotting.missions import outcomes_figure
 from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
-from torchgco.scenarios import Layouts
+from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
 SHOWN_LAYOUTS = 12  # layouts in a picture, at most
@@ -137,10 +135,10 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
     return {**arrays, "start": start, "goal": goal}, {**how, "obstacles": obstacles}
 
 
-def _draw(folder: Path, name: str, figure: Callable[[], Figure]) -> None:
+def _draw(folder: Path, name: str, figure: Callable[[], Figure], dpi: int = 150) -> None:
     ending = "pdf" if name.endswith(".pdf") else "png"
     path = folder / "figures" / f"{name.removesuffix(f'.{ending}')}.{ending}"
-    write(path, lambda file: save(figure(), file, dpi=300 if name == "study.png" else 150, form=ending))
+    write(path, lambda file: save(figure(), file, dpi=300 if name == "study.png" else dpi, form=ending))
 
 
 def drawings(part: Part) -> Drawings:
@@ -163,7 +161,7 @@ def drawings(part: Part) -> Drawings:
     if not mission and summary["n"].max() > 1:  # of a single trial nothing is a rate
         to_draw["rates"] = lambda: rates_figure(summary)
     elif len(shown := several(trials)):
-        to_draw["outcomes"] = lambda: outcomes_figure(shown)
+        to_draw["outcomes"] = lambda: of_missions.outcomes_figure(shown)
     return to_draw | _distributions(trials, "missions-" if mission else "")
 
 
@@ -271,6 +269,7 @@ def _verify(options: argparse.Namespace) -> int:
     return 1 if any(study.differs for study in studies) else 0
 
 
+SMALL_DPI = 110  # of figures of which a mission or fleet has several
 SNAPSHOTS = 4  # instants of a mission in one figure
 
 
@@ -308,7 +307,7 @@ def write_mission_report(folder: Path, tasks: Tasks, figures: bool = True) -> st
     parts = parts_of(trials)
     write_tables(folder, parts)
     if figures:
-        draw_all(_drawings(folder, trials, tasks))
+        draw(_drawings(folder, trials, tasks))
     text = format_report(parts, "table")
     return mission_lines(trials) if trials["layout"].nunique() <= PLANS_KEPT else text
 
@@ -318,11 +317,10 @@ def _drawings(folder: Path, trials: pd.DataFrame, tasks: Tasks) -> dict[str, Cal
     to_draw: dict[str, Callable[[], object]] = {}
 
     def add(name: str, figure: Callable[[], Figure]) -> None:
-        path = folder / "figures" / f"{name}.png"
-        to_draw[name] = lambda: write(path, lambda file: save(figure(), file, dpi=110))
+        to_draw[name] = partial(_draw, folder, name, figure, SMALL_DPI)
 
     if len(shown := several(trials)):
-        add("outcomes", lambda: figures.outcomes_figure(shown))
+        add("outcomes", lambda: of_missions.outcomes_figure(shown))
     if not all((folder / name).is_file() for name in (PLANS_FILE, TIME_STEPS)):  # of many missions
         return to_draw
     with np.load(folder / PLANS_FILE, allow_pickle=False) as flown:
@@ -335,16 +333,16 @@ def _drawings(folder: Path, trials: pd.DataFrame, tasks: Tasks) -> dict[str, Cal
         if not rows:  # a start in contact
             continue
         fine = {name: fine[name] for name in rows}  # of solvers that never flew there is the start alone
-        add(f"{number}-compute", partial(figures.compute_figure, rows, period))
+        add(f"{number}-compute", partial(of_missions.compute_figure, rows, period))
         if len(course.reaches):
-            add(f"{number}-distance", partial(figures.distance_figure, fine, course))
+            add(f"{number}-distance", partial(of_missions.distance_figure, fine, course))
         for name, frame in rows.items():
             plan, label = plans[name][number][: len(frame)], f"{number}-{name}"
             steps = np.linspace(0, 0.8 * (len(frame) - 1), SNAPSHOTS).round().astype(int).tolist()
-            add(f"{label}-snapshots", partial(figures.snapshots_figure, frame, plan, course, steps, period))
-            add(f"{label}-commands", partial(figures.commands_figure, fine[name], airframe))
-            add(f"{label}-states", partial(figures.states_figure, fine[name], course.goal))
-            add(f"{label}-tracking", partial(figures.tracking_figure, frame))
+            add(f"{label}-snapshots", partial(of_missions.snapshots_figure, frame, plan, course, steps, period))
+            add(f"{label}-commands", partial(of_missions.commands_figure, fine[name], airframe))
+            add(f"{label}-states", partial(of_missions.states_figure, fine[name], course.goal))
+            add(f"{label}-tracking", partial(of_missions.tracking_figure, frame))
             gif = folder / "figures" / f"{label}.gif"
             to_draw[f"{label}.gif"] = partial(mission_animation, frame, plan, course, period, gif, name)
     return to_draw
@@ -367,3 +365,30 @@ def _course(tasks: Tasks, number: int) -> tuple[Course, float]:
         vehicle = float(body.inner.vehicle_radius[0])
     course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates, body)
     return course, float(task.problem.dynamics.dt)
+
+
+SHOWN_FLEETS = 4  # fleets that get a picture and an animation, at most
+
+
+def write_fleet_report(folder: Path, vehicle: Vehicle, layouts: Layouts, figures: bool = True) -> str:
+    """Write vehicles.parquet, the tables and figures next to the `trials.parquet` in a folder; returns the table."""
+    with np.load(folder / SOLUTIONS, allow_pickle=False) as flown:
+        controls = dict(zip(flown["solver"].tolist(), flown["U"], strict=True))
+    table = vehicles_table(vehicle, layouts, controls)
+    write(folder / VEHICLES, lambda file: table.to_parquet(file, index=False))
+    if figures:
+        draw(_fleet_drawings(folder, vehicle, layouts.take(range(min(SHOWN_FLEETS, layouts.count))), controls))
+    return write_report(folder, figures=figures)
+
+
+def _fleet_drawings(
+    folder: Path, vehicle: Vehicle, layouts: Layouts, controls: dict[str, np.ndarray]
+) -> dict[str, Callable[[], object]]:
+    """Functions that draw and write a picture and an animation of each fleet, by the solver under study."""
+    to_draw, U = dict[str, Callable[[], object]](), next(iter(controls.values()))
+    for place, number in enumerate(layouts.ids.tolist()):
+        label, one = f"{layouts.name}-{number}", [place]
+        found = solution_of(vehicle, layouts.take(one), U[one])
+        to_draw[label] = partial(_draw, folder, label, partial(fleet_figure, *found.arrays(), None), SMALL_DPI)
+        to_draw[f"{label}.gif"] = partial(fleet_animation, *found.arrays(), folder / "figures" / f"{label}.gif")
+    return to_draw

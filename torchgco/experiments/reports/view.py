@@ -1,4 +1,4 @@
-"""`torchgco-view RUN`: a page of a finished study, which one turns around; see docs/view.md."""
+"""`torchgco-view RUN`: a page of a finished study, and of some layouts their search, solved again; see docs/view.md."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from torch import Tensor
 
 from torchgco.base.draws import DrawKey
 from torchgco.base.errors import InputError
-from torchgco.experiments.ending import say
+from torchgco.experiments.ending import RunParser, say
 from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.reports.finished import MEASURED_AT_ONCE, Study, document_of, missions
-from torchgco.experiments.reports.parser import RunParser
 from torchgco.experiments.results.durations import states_of
 from torchgco.experiments.results.files import write
 from torchgco.experiments.results.folder import SOLUTIONS

@@ -1,4 +1,4 @@
-"""The folder of a study: shards while it runs, tables and arrays when it is done.
+"""The folder of a study: shards while it runs, tables and arrays when it is done, and the success of its trials.
 
 Every file is moved to its place whole (`files.write`), so that a study killed at any moment leaves whole files and a
 second start resumes from them. Files are checked against the study's manifest when they are read again: a damaged or

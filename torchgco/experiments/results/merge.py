@@ -1,4 +1,4 @@
-"""One table from the trials of many runs, in which different solvers and layouts never share a name.
+"""One table from the trials of many runs: what differs between them becomes columns and names of solvers.
 
 A layout is known by its digest and a solver by the digest of its settings, both columns of a study's trials.
 """

@@ -15,8 +15,7 @@ import numpy as np
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, Count, Meters, NonNegative, Share, Within, check_options
 from torchgco.exploration.sensing.library import call
-from torchgco.maps.grid import OccupancyGrid
-from torchgco.maps.points import PointCloud
+from torchgco.maps.grid import OccupancyGrid, PointCloud
 from torchgco.obstacles.attitude import rotation
 from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem

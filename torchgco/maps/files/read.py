@@ -26,8 +26,7 @@ from torchgco.maps.files.pcd import read_pcd
 from torchgco.maps.files.ply import read_ply
 from torchgco.maps.files.source import FARTHEST_AT, LEAST_CELL, Source
 from torchgco.maps.files.text import read_xyz
-from torchgco.maps.grid import OccupancyGrid, coordinates, number
-from torchgco.maps.points import PointCloud
+from torchgco.maps.grid import OccupancyGrid, PointCloud, coordinates, number
 
 
 @dataclass(frozen=True)

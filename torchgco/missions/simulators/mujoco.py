@@ -1,4 +1,4 @@
-"""MuJoCo as a plant: the rotor commands fly a quadrotor of MJCF, written from the vehicle or of a user's file."""
+"""MuJoCo as a plant: the rotor commands fly a quadrotor of MJCF, written from an `Airframe` or of a user's file."""
 
 from __future__ import annotations
 

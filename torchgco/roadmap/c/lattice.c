@@ -1,4 +1,4 @@
-/* The cheapest ways over blocks of a lattice, and paths drawn taut through it (roadmap/blocks.py, roadmap/mapped.py).
+/* The cheapest ways over blocks of a lattice, and paths drawn taut through it (roadmap/lattice.py, roadmap/mapped.py).
    Two dimensions are three, with one layer. */
 #include <math.h>
 #include <stdlib.h>
