@@ -21,10 +21,9 @@ from torchgco.native.interior import Kept
 PERIODS = 40  # of the test
 EXAMPLE = 20  # of the example
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
-# Bytes of stack of a step: frames without matrices, and how many matrices of (n + m + 1)^2 numbers lie there at once.
-# tests/export/test_stack.py adds the frames of the longest chain of calls.
-FRAMES, MATRICES = 4096, 4
-SPARE = 4096  # bytes of a sample's stack beside those: for libm, and implicit steps, which take 2.3 kB more
+# Bytes of stack of a step, at most, on a Cortex-M; tests/export/test_stack.py measures it. Matrices lie in the workspace.
+STACK = 4096
+SPARE = 4096  # bytes of a sample's stack beside those: for long functions, such as implicit steps
 Build = Literal["cmake", "arduino", "zephyr"]
 # The files beside NAME.h and NAME.c, of what builds a folder, and from which templates; the last two have both in src.
 TEMPLATES: dict[Build, dict[str, str]] = {
@@ -48,6 +47,9 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("no-schedule-insns") /* else long functions take half as much stack again */
+#endif
 #if defined(ARDUINO) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize("fp-contract=off", "no-math-errno") /* Arduino gives a library no options */
 #endif
@@ -93,11 +95,6 @@ class Exported:
         p = self.kept.problem
         return (p.N + 1) * p.n, p.N * p.m, p.N * p.m * p.n
 
-    @property
-    def stack(self) -> int:
-        """Bytes of stack of a step."""
-        return FRAMES + 8 * MATRICES * (self.kept.problem.n + self.kept.problem.m + 1) ** 2
-
 
 def write_files(exported: Exported, folder: Path, build: Build) -> Path:
     """Write them all; returns the folder."""
@@ -107,7 +104,7 @@ def write_files(exported: Exported, folder: Path, build: Build) -> Path:
         "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
         "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.kept.problem.x0),
         "EXAMPLE": EXAMPLE, "PERIODS": len(periods[2]), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
-        "STACK": exported.stack + SPARE,
+        "STACK": STACK + SPARE,
     }  # fmt: skip
     files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}
     for file, template in TEMPLATES[build].items():
@@ -208,7 +205,7 @@ def _readme(exported: Exported, words: dict[str, Any]) -> str:
     workspace = 8 * (2 * X + 2 * U + K + lam + count + exported.solver.room) + 64
     return _filled(
         "README.md", exported, **words, WORKSPACE=f"{workspace:,}", TABLES=f"{exported.solver.flash:,}",
-        BYTES=f"{exported.stack:,}", ROWS="\n".join(rows) or "| | | | | |",
+        BYTES=f"{STACK:,}", ROWS="\n".join(rows) or "| | | | | |",
     )  # fmt: skip
 
 

@@ -33,10 +33,12 @@ TYPES = {
 # Files of the kernels, and what takes their places.
 REPLACED = {
     "vectors.h": C / "scalar" / "vectors.h", "wide.h": C / "scalar" / "wide.h",
-    "allocation.h": HERE / "arena.h", "clock.h": HERE / "seconds.h",
+    "allocation.h": HERE / "arena.h", "stack.h": HERE / "stack.h", "clock.h": HERE / "seconds.h",
 }  # fmt: skip
 FILES = "riccati.c", "interior.c", "sweep.h", "rollout.h"  # the interior point, sweeps and rollouts
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
+ON_STACK = 128  # numbers of one stage that a step has on the stack, at most: 1 kB
+HELD = 240  # numbers of the structures Barrier and Track, at most
 SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
 
 
@@ -134,7 +136,7 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
         rows, fields, writer.body(how, of="&b->problem"), changing, made, _rest(kept, changing, writer, rest)
     )
     count = _count(kept)
-    need = count + (K + 1) * (POINTERS_OF_ROWS + 2)
+    need = count + HELD + (K + 1) * (POINTERS_OF_ROWS + 2)
     sizes = problem.N + 1, problem.N, problem.n, problem.m
     room = need + _solve_size(K, sizes, [len(kept_by(how)[address].flatten()) for address in changing.copied])
     texts = {name: own.read_text() for name, own in REPLACED.items()}
@@ -146,7 +148,7 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
         _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
     ]  # fmt: skip
     flash = writer.flash + 8 * sum(m.size for m in changing.members) + sum(part.flash for part in made)
-    solver = kept.engine.form.alone(FILES, texts, declared, KINDS=sum(1 << kind for kind in _kinds(kept)))
+    solver = kept.engine.form.alone(FILES, texts, declared, KINDS=sum(1 << kind for kind in _kinds(kept)), ON_STACK=ON_STACK)
     return Solver(solver, "\n".join(own), room, multipliers, flash)
 
 
@@ -175,7 +177,9 @@ def _solve_size(K: int, sizes: tuple[int, int, int, int], made: list[int]) -> in
     knots, N, n, m = sizes
     size = lambda kind: -(-ctypes.sizeof(kind) // 8)
     structures = size(c.Interior) + 2 * size(c.Problem) + max(1, K) * size(c.Constraint)
-    return structures + knots * n + 2 * N * m + N * m * (n + 1) + sum(made) + SCALARS
+    stage = (n + m) * (n + m) + (n + m) * n + m * n
+    own = structures + (stage if stage > ON_STACK else 0)
+    return own + knots * n + 2 * N * m + N * m * (n + 1) + sum(made) + SCALARS
 
 
 def _places(kept: Kept, changing: Changing, multipliers: dict[int, int]) -> dict[int, str]:
@@ -321,7 +325,7 @@ def _structure(K: int, made: list[str]) -> str:
 
 
 def _assertion(count: int, K: int) -> str:
-    need = f"{count} * sizeof(double) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t))"
+    need = f"{count} * sizeof(double) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t)) + sizeof(Barrier) + sizeof(Track)"
     return f"typedef char NAME_has_room[sizeof(Solve) + {need} <= sizeof(((NAME_workspace *)0)->room) ? 1 : -1];"
 
 

@@ -133,10 +133,10 @@ static void to_middle(double *z, double lower, double upper) {
 
 /* What a trajectory X, U costs, and by how much it violates the constraints; returns 0 without memory. */
 static int judge(Solve *b, double *X, double *U, double *cost, double *violation) {
-    Lanes lanes, *s = &lanes;
     I caught;
     b->follow.X = X; b->follow.U = U;
     b->arena.next = b->arena_begin;
+    LOCAL(Lanes, s, &b->follow);
     if (!start(s, &b->follow)) return 0;
     enter_iterate(s, 0, 0);
     *violation = swept(s, 0, 0, SET(0.0), &caught).violation;
@@ -280,11 +280,11 @@ static double too_deep(const Lanes *s, int64_t i, const V *x) {
 /* Whether the vehicle touches an obstacle at the start. */
 static int starts_inside(Solve *b, const double *x) {
 #if DIM > 0
-    Lanes lanes, *s = &lanes;
     int inside = 0;
     memcpy(b->X, x, NX * sizeof *x);
     b->follow.X = b->X; b->follow.U = b->U;
     b->arena.next = b->arena_begin;
+    LOCAL(Lanes, s, &b->follow);
     if (!start(s, &b->follow)) return 0;
     enter_problem(s, 0, 0);
     for (int64_t i = 0; i < s->of->constraints; i++) {
