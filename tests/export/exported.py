@@ -14,10 +14,10 @@ from torchgco.native.compiler import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 ARM = Path(__file__).parent / "arm"
-M7 = (
-    "-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard", "-mthumb", "-std=gnu99", "-ffp-contract=off",
-    "-fno-math-errno",
-)  # fmt: skip
+THUMB = "-mfloat-abi=hard", "-mthumb", "-std=gnu99", "-ffp-contract=off", "-fno-math-errno"
+M7 = "-mcpu=cortex-m7", "-mfpu=fpv5-d16", *THUMB
+M4F = "-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *THUMB
+BOARDS = {M7: "mps2-an500", M4F: "mps2-an386"}  # of QEMU
 STRICT = "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-fno-math-errno"
 SAME = "40 of 40 periods have the same bits, status and iterations; 40 converged; largest difference 0"
 
@@ -38,10 +38,10 @@ def said(*words: str | Path, folder: Path) -> str:
     return done.stdout
 
 
-def on_m7(level: str, *files: str, folder: Path, program: Path) -> str:
-    """What a program prints on an emulated Cortex-M7."""
+def on_board(board: tuple[str, ...], level: str, *files: str, folder: Path, program: Path) -> str:
+    """What a program prints on an emulated Cortex-M."""
     words = ARM / "start.c", "-T", ARM / "memory.ld", "-nostartfiles", "--specs=rdimon.specs"
     linked = "-Wl,--no-warn-rwx-segments", "-lm", "-o", program
-    said("arm-none-eabi-gcc", *M7, level, *files, *words, *linked, folder=folder)
-    machine = "-M", "mps2-an500", "-nographic", "-semihosting-config", "enable=on,target=native", "-kernel"
+    said("arm-none-eabi-gcc", *board, level, *files, *words, *linked, folder=folder)
+    machine = "-M", BOARDS[board], "-nographic", "-semihosting-config", "enable=on,target=native", "-kernel"
     return said("qemu-system-arm", *machine, program, folder=folder)

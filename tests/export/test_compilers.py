@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.export.exported import SAME, STRICT, exported, needs, needs_compiler, on_m7, said
+from tests.export.exported import M7, SAME, STRICT, exported, needs, needs_compiler, on_board, said
 from tests.export.kinds import KINDS, car
 from tests.slow import mostly
 from torchgco import Spheres, StateBounds
@@ -132,7 +132,7 @@ def test_a_64_bit_arm(folder: Path, tmp_path: Path) -> None:
 
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m7(folder: Path, tmp_path: Path) -> None:
-    assert on_m7("-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run").startswith(SAME)
+    assert on_board(M7, "-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run").startswith(SAME)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.export import car, linear, quadrotor
-from tests.export.exported import M7, STRICT, exported, needs, needs_compiler, on_m7, said
+from tests.export.exported import ARM, M7, STRICT, exported, needs, needs_compiler, on_board, said
 from tests.export.kinds import KINDS
 from tests.slow import mostly
 from torchgco.export.files import SPARE, STACK
@@ -26,19 +26,12 @@ PAINTED = """
 #define main compared
 #include "car_test.c"
 #undef main
-#include <stdint.h>
-#define PAINT 0xa5
-enum { BELOW = 16384 };
-static int used(void) {
-    volatile uint8_t *top = (volatile uint8_t *)__builtin_frame_address(0) - 256, *at = top - BELOW;
-    double u[car_NU];
-    for (volatile uint8_t *a = at; a < top; a++) *a = PAINT;
-    for (int k = 0; k < PERIODS; k++) car_step(&workspace, states + k * car_NX, k ? car_STAGES : 0, INFINITY, u);
-    while (at < top && *at == PAINT) at++;
-    return (int)(top - at) + 256;
-}
+#include "paint.h"
 int main(void) {
+    double u[car_NU];
     car_init(&workspace);
+    paint();
+    for (int k = 0; k < PERIODS; k++) car_step(&workspace, states + k * car_NX, k ? car_STAGES : 0, INFINITY, u);
     printf("%d bytes\\n", used());
     return 0;
 }
@@ -103,7 +96,7 @@ def test_painted_stack_on_a_cortex_m7(kind: str, tmp_path: Path) -> None:
     """With what libm takes: bytes below a step's caller that 40 periods have changed."""
     folder = exported(PROBLEMS[kind](), tmp_path)
     (folder / "painted.c").write_text(PAINTED)
-    used = int(on_m7("-O2", "car.c", "painted.c", folder=folder, program=tmp_path / "run").split()[0])
+    used = int(on_board(M7, "-O2", f"-I{ARM}", "car.c", "painted.c", folder=folder, program=tmp_path / "run").split()[0])
     assert 1000 < used <= STACK, used
 
 

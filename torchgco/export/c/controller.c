@@ -2,7 +2,7 @@
 
 static double seconds_of(const void *arena) {
     double (*seconds)(void) = ((const Arena *)arena)->seconds;
-    return seconds ? seconds() : 0.0;
+    return seconds ? seconds() : 0;
 }
 
 static int all_finite(const double *values, int count) {
@@ -160,7 +160,7 @@ static int is_rounding(const double *old, const double *new) {
         double most = 0;
         for (int k = 0; k <= N; k++) if (fabs(old[k * NX + i]) > most) most = fabs(old[k * NX + i]);
         for (int k = 0; k <= N; k++)
-            if (!(fabs(new[k * NX + i] - old[k * NX + i]) <= ROUNDINGS * 0x1p-52 * most)) return 0;
+            if (!(fabs(new[k * NX + i] - old[k * NX + i]) <= ROUNDINGS * LAST_BIT * most)) return 0;
     }
     return 1;
 }
@@ -343,7 +343,7 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
     }
     if (solved) return CONVERGED;
     for (int i = 0; i < N * NU; i++) if (fabs(b->U[i]) > largest) largest = fabs(b->U[i]);
-    double violation = w->violation <= 0x1p-52 * largest ? 0 : w->violation;
+    double violation = w->violation <= LAST_BIT * largest ? 0 : w->violation;
     int sound = b->cost - b->cost == 0 && violation - violation == 0 && is_finite_rollout(b), status = b->status;
     int fits = sound && violation <= VIOLATION, guess_fits = guess_violation <= VIOLATION;
     int better = guess_fits ? !fits || guess_cost < b->cost : !fits && guess_violation < violation;
