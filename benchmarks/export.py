@@ -149,11 +149,11 @@ def text_of(level: str, folder: Path, dtype: torch.dtype) -> int:
 
 
 def counted(level: str, folder: Path, dtype: torch.dtype) -> np.ndarray:
-    """Of each period status, whether controls are Python's, iterations, instructions and bytes of stack, (periods, 5)."""
+    """Of periods status, whether controls are Python's, iterations, instructions and bytes of stack, (periods, 5)."""
     board, flags = BOARDS[dtype]
     (folder / "counted.c").write_text(COUNTED if dtype == DOUBLE else single(COUNTED))
-    words = f"-I{ARM}", "car.c", "counted.c", ARM / "start.c", "-T", ARM / "memory.ld", "-nostartfiles", "--specs=rdimon.specs"
-    said("arm-none-eabi-gcc", *flags, level, *words, "-lm", "-o", "run", folder=folder)
+    words = "car.c", "counted.c", ARM / "start.c", "-T", ARM / "memory.ld", "-nostartfiles", "--specs=rdimon.specs"
+    said("arm-none-eabi-gcc", *flags, level, f"-I{ARM}", *words, "-lm", "-o", "run", folder=folder)
     emulator = "qemu-system-arm", "-M", board, "-nographic", "-icount", "shift=6"
     host = "-semihosting-config", "enable=on,target=native"
     rows = np.array(
@@ -173,7 +173,8 @@ def row_of(name: str) -> list[str]:
     cold, warm = rows[0], rows[1:]
     print(name, "done", file=sys.stderr, flush=True)
     return [
-        name, f"{int(workspace[1].replace(',', '')) / 1000:.0f}", f"{cold[4] / 1000:.1f}", *(f"{size / 1000:.0f}" for size in sizes),
+        name, f"{int(workspace[1].replace(',', '')) / 1000:.0f}", f"{cold[4] / 1000:.1f}",
+        *(f"{size / 1000:.0f}" for size in sizes),
         f"{int((rows[:, 0] == 1).sum())}, {int(rows[:, 1].sum())} of {len(rows)}",
         f"{cold[3] / 1e6:.1f} ({cold[2]:.0f})", f"{warm[:, 3].mean() / 1e6:.2f} ({warm[:, 2].mean():.1f})",
         f"{warm[:, 3].max() / 1e6:.1f} ({warm[warm[:, 3].argmax(), 2]:.0f})",
@@ -182,7 +183,8 @@ def row_of(name: str) -> list[str]:
 
 def table(problems: list[str]) -> str:
     head = (
-        "problem", "memory, kB", "stack, kB", "code -Os, kB", "code -O2, kB", "converged, as in Python", "from rest, 1e6 instructions",
+        "problem", "memory, kB", "stack, kB", "code -Os, kB", "code -O2, kB", "converged, as in Python",
+        "from rest, 1e6 instructions",
         "a warm step, mean", "the longest",
     )  # fmt: skip
     names = [name for name in PROBLEMS if any(word in name for word in problems)]

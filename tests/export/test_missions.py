@@ -55,7 +55,7 @@ def test_a_mission_ends_with_the_bits_of_python(folder: Path) -> None:
 
 
 def acted(controller: Any) -> list[Tensor]:
-    """States of an environment's vehicle, which is asked for what the plan has two periods later, as `PlannerPolicy`."""
+    """States of an environment's vehicle, asked for what the plan has two periods later, as by `PlannerPolicy`."""
     env = MissionVectorEnv(1, problem(), mission(duration=2.0))
     env.reset(seed=5)
     passed = [env.episodes.x.clone()]

@@ -96,7 +96,8 @@ def test_painted_stack_on_a_cortex_m7(kind: str, tmp_path: Path) -> None:
     """With what libm takes: bytes below a step's caller that 40 periods have changed."""
     folder = exported(PROBLEMS[kind](), tmp_path)
     (folder / "painted.c").write_text(PAINTED)
-    used = int(on_board(M7, "-O2", f"-I{ARM}", "car.c", "painted.c", folder=folder, program=tmp_path / "run").split()[0])
+    files = f"-I{ARM}", "car.c", "painted.c"
+    used = int(on_board(M7, "-O2", *files, folder=folder, program=tmp_path / "run").split()[0])
     assert 1000 < used <= STACK, used
 
 

@@ -23,8 +23,7 @@ PERIODS = 40  # of the test
 EXAMPLE = 20  # of the example
 NEAR = 1e-3  # of the range of controls along the test, that those in single precision may differ from Python's
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
-# Bytes of stack of a step, at most, on a Cortex-M; tests/export/test_stack.py measures it. Matrices lie in the workspace.
-STACK = 4096
+STACK = 4096  # bytes of a step, at most, on a Cortex-M: matrices lie in the workspace. tests/export/test_stack.py
 SPARE = 4096  # bytes of a sample's stack beside those: for long functions, such as implicit steps
 Build = Literal["cmake", "arduino", "zephyr"]
 # The files beside NAME.h and NAME.c, of what builds a folder, and from which templates; the last two have both in src.
@@ -55,7 +54,7 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 #if defined(ARDUINO) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize("fp-contract=off", "no-math-errno") /* Arduino gives a library no options */
 #endif
-@SIZE@#define int64_t int32_t /* counters: no array is so long, and small processors take a tenth less code */
+@NEEDS@#define int64_t int32_t /* counters: no array is so long, and small processors take a tenth less code */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #pragma GCC diagnostic ignored "-Wunused-parameter"
@@ -67,6 +66,7 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 #pragma clang diagnostic ignored "-Wbitwise-instead-of-logical"
 #endif
 """
+NEEDS = "typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];\n"
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,10 @@ def _code(exported: Exported) -> str:
     ]
     parts = {"NO_MULTIPLIERS": "\n".join(none) or "    (void)w;", "SHIFTS": "\n".join(shifts)}
     head = HEAD.format(version=VERSION)
-    size = "typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];\n" if exported.number == 8 else ""
-    return replaced(head, exported.name, SIZE=replaced(size, exported.name)) + solver.solver + replaced(solver.controller, exported.name, **parts)
+    needs = NEEDS if exported.number == 8 else ""
+    return (
+        replaced(head, exported.name, NEEDS=needs) + solver.solver + replaced(solver.controller, exported.name, **parts)
+    )
 
 
 def _periods(exported: Exported) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:

@@ -175,11 +175,9 @@ class LoadedController:
         return torch.from_numpy(u).double()
 
     def raw_step(self, x: Floats, stages: float, max_seconds: float, u: Floats) -> int:
-        """`NAME_step` itself, with states x (n,) and room for controls u (m,) of its own type; returns what C returns."""
+        """`NAME_step` itself, with states x (n,) and room for controls u (m,), of C's type; returns what C returns."""
         times = self._real(stages), ctypes.c_double(max_seconds)
-        return int(
-            self._functions["step"](ctypes.byref(self._workspace), self._pointer(x), *times, self._pointer(u))
-        )
+        return int(self._functions["step"](ctypes.byref(self._workspace), self._pointer(x), *times, self._pointer(u)))
 
     def _pointer(self, array: np.ndarray) -> Any:
         return array.ctypes.data_as(ctypes.POINTER(self._real))

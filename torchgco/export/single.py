@@ -40,7 +40,7 @@ def options_in_single(options: BarrierOptions) -> BarrierOptions:
     """Options of an interior point that computes all in single precision.
 
     It goes on until the error falls by half no more in two iterations, as it can't be met to the last bit, and ends
-    where it is below 1e-4 then. A barrier that makes up 1e-3 of the cost is pressed further: rounding of phi hides less.
+    where it is below 1e-4 then. A barrier that makes up 1e-3 of the cost is pressed further: rounding hides less.
     """
     return replace(
         fitted(options, torch.float32),

@@ -152,7 +152,8 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
         _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
     ]  # fmt: skip
     flash = writer.flash + number * sum(m.size for m in changing.members) + sum(part.flash for part in made)
-    solver = kept.engine.form.alone(FILES, texts, declared, KINDS=sum(1 << kind for kind in _kinds(kept)), ON_STACK=ON_STACK)
+    sizes = {"KINDS": sum(1 << kind for kind in _kinds(kept)), "ON_STACK": ON_STACK}
+    solver = kept.engine.form.alone(FILES, texts, declared, **sizes)
     return Solver(solver, "\n".join(own), room, multipliers, flash)
 
 
@@ -293,7 +294,8 @@ def _constants(interior: InteriorPoint, constrained: bool, number: int) -> str:
     violation = interior.violation_tolerance if number == 8 else max(interior.violation_tolerance, VIOLATION)
     values: dict[str, Any] = {
         "WARM_MU": interior.warm_barrier, "WARM_PUSH": interior.warm_barrier, "COLD_MU": interior.initial_barrier,
-        "COLD_PUSH": interior.bound_push, "VIOLATION": violation, "LAST_BIT": 2.0**-52 if number == 8 else 2.0**-23, "ADMITTED": ADMITTED,
+        "COLD_PUSH": interior.bound_push, "VIOLATION": violation, "ADMITTED": ADMITTED,
+        "LAST_BIT": 2.0**-52 if number == 8 else 2.0**-23,
         "MAX_SOLVE_ITERATIONS": interior.max_iterations, "LOOSE": LOOSE, "CONTACT": CONTACT_FACTOR,
         "STATIONARY": STATIONARY, "CONSTRAINED": int(constrained), "STAGE_ROUNDING": STAGE_ROUNDING,
         "SADDLE_FIRST": SADDLE_STEPS[0], "SADDLE_LAST": SADDLE_STEPS[1],

@@ -134,9 +134,8 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
     # They are added where they are found: an array of all of them would be half of a step's stack.
     end = entries.rindex(f"static inline void {name}_entries")  # stages before it have outputs of their own
     added = re.sub(rf"\b{written}\[(\d+)\] =", lambda at: f"{written}[{places[int(at[1])]}] +=", entries[end:])
-    return "\n".join(
-        [entries[:end] + added, f"TGCO_APART void {name}({arguments}, OUT H) {{", f"    {name}_entries({passed}, H);", "}"]
-    )
+    head, call = f"TGCO_APART void {name}({arguments}, OUT H) {{", f"    {name}_entries({passed}, H);"
+    return "\n".join([entries[:end] + added, head, call, "}"])
 
 
 def _hessian(total: Any, z: Any, inputs: list[Any], made: Container[int] = ()) -> Any:
