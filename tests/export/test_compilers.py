@@ -8,17 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.export.exported import SAME, STRICT, exported, needs, needs_compiler, said
+from tests.export.exported import M7, SAME, STRICT, exported, needs, needs_compiler, on_board, said
 from tests.export.kinds import KINDS, car
 from tests.slow import mostly
 from torchgco import Spheres, StateBounds
 
 pytestmark = needs_compiler
-ARM = Path(__file__).parent / "arm"
 NATIVE = "-march=native"
-M7 = "-mcpu=cortex-m7", "-mfpu=fpv5-d16", "-mfloat-abi=hard", "-mthumb"
 # Bytes of text of gcc 12 -Os and of the workspace on 64 bits, by problem: a page of results has more.
-SIZES = {"bounds": (50_831, 43_344), "discs": (53_402, 35_960)}
+SIZES = {"bounds": (50_293, 45_264), "discs": (52_706, 37_880)}
 GROWTH = 1.05
 
 
@@ -134,13 +132,7 @@ def test_a_64_bit_arm(folder: Path, tmp_path: Path) -> None:
 
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m7(folder: Path, tmp_path: Path) -> None:
-    words = "car.c", "car_test.c", ARM / "start.c", "-T", ARM / "memory.ld", "-nostartfiles", "--specs=rdimon.specs"
-    flags = *M7, "-std=gnu99", "-Os", "-ffp-contract=off", "-fno-math-errno"
-    said(
-        "arm-none-eabi-gcc", *flags, *words, "-Wl,--no-warn-rwx-segments", "-lm", "-o", tmp_path / "run", folder=folder
-    )
-    machine = "-M", "mps2-an500", "-nographic", "-semihosting-config", "enable=on,target=native", "-kernel"
-    assert said("qemu-system-arm", *machine, tmp_path / "run", folder=folder).startswith(SAME)
+    assert on_board(M7, "-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run").startswith(SAME)
 
 
 @pytest.mark.slow

@@ -73,9 +73,10 @@ def test_the_command_writes_the_controller_of_a_configuration(tmp_path: Path, ca
 
 def test_the_command_writes_a_library_for_arduino(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     target = tmp_path / "boat"
-    assert export.main([*WORDS, "--c", "boat", "--output", str(target), "--build", "arduino"]) == 0
+    assert export.main([*WORDS, "--c", "boat", "--output", str(target), "--build", "arduino", "--single"]) == 0
     files = [path for path in target.rglob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files) / 1e6
+    assert "float u[boat_NU]" in (target / "src" / "boat.h").read_text()
     assert target / "src" / "boat.c" in files and f"boat.c, {size:.2f} MB" in capsys.readouterr().out
 
 
@@ -88,6 +89,7 @@ def test_the_command_writes_a_library_for_arduino(tmp_path: Path, capsys: pytest
         ((*WORDS, "--c", "boat", "--changes", "wind"), "wind"),
         (("nowhere", "--c", "boat"), "RUN"),
         (("nowhere", "--build", "zephyr"), "--build"),
+        (("nowhere", "--single"), "--single"),
         (("one", "two"), "RUN"),
     ],
 )

@@ -22,6 +22,7 @@ from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
 
+BYTES = {torch.float64: 8, torch.float32: 4}  # of numbers in C
 C_WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if inline int long register "
     "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while"
@@ -35,6 +36,7 @@ def export_c(
     receding: bool = True,
     changes: Sequence[str] | None = None,
     build: Build = "cmake",
+    dtype: torch.dtype = torch.float64,
 ) -> Path:
     """Write a problem's interior point as C99 that stands alone: no heap, no global state, no library but libm.
 
@@ -57,18 +59,22 @@ def export_c(
             the others are constants. None: all that C reads as they are or copies of.
         build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
             "zephyr", a module with a sample. Of the last two NAME.h and NAME.c lie in `src`.
+        dtype: of all numbers in C. torch.float32 is for processors without a unit for doubles: half of the memory, and
+            controls to about 1e-4 of their range, as it ends earlier.
 
     Returns:
         the folder.
 
     Raises:
         InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
-            start, horizons, `RateBounds`, `Link` or `Integral`, single precision, code that can't be compiled, where
-            `receding` obstacles that move without numbers that say where they are; a number that can't change. No file
-            is written then.
+            start, horizons, `RateBounds`, `Link` or `Integral`, a problem in single precision, code that can't be
+            compiled, where `receding` obstacles that move without numbers that say where they are; a number that can't
+            change; another dtype. No file is written then.
     """
     check_value(receding, bool, "receding")
     check_value(build, Build, "build")
+    if dtype not in BYTES:
+        raise InputError("dtype", "torch.float64 or torch.float32", shown(dtype))
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
         raise InputError("name", "a word of C, such as controller", shown(name))
     if isinstance(problem, Compiled):
@@ -86,8 +92,8 @@ def export_c(
         raise InputError("problem", "obstacles whose places C reads as they are, where they move", lacking[0])
     with torch.no_grad():
         rest = _guess_at_rest(problem)
-    solver = solver_source(kept, some, compiled.interior, rest)
-    exported = Exported(compiled, kept, solver, some, name, receding)
+    solver = solver_source(kept, some, compiled.interior, rest, BYTES[dtype])
+    exported = Exported(compiled, kept, solver, some, name, receding, BYTES[dtype])
     return write_files(exported, Path(folder), build)
 
 

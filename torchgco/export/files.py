@@ -14,17 +14,17 @@ from torchgco.base.version import VERSION
 from torchgco.compiled import Compiled, compile
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.export.numbers import Changing, Member
+from torchgco.export.single import single
 from torchgco.export.source import HERE, Solver, replaced, table
 from torchgco.native.codegen.emit import literal
 from torchgco.native.interior import Kept
 
 PERIODS = 40  # of the test
 EXAMPLE = 20  # of the example
+NEAR = 1e-3  # of the range of controls along the test, that those in single precision may differ from Python's
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
-# Bytes of stack of a step: frames without matrices, and how many matrices of (n + m + 1)^2 numbers lie there at once.
-# tests/export/test_stack.py adds the frames of the longest chain of calls.
-FRAMES, MATRICES = 4096, 4
-SPARE = 4096  # bytes of a sample's stack beside those: for libm, and implicit steps, which take 2.3 kB more
+STACK = 4096  # bytes of a step, at most, on a Cortex-M: matrices lie in the workspace. tests/export/test_stack.py
+SPARE = 4096  # bytes of a sample's stack beside those: for long functions, such as implicit steps
 Build = Literal["cmake", "arduino", "zephyr"]
 # The files beside NAME.h and NAME.c, of what builds a folder, and from which templates; the last two have both in src.
 TEMPLATES: dict[Build, dict[str, str]] = {
@@ -48,11 +48,13 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("no-schedule-insns") /* else long functions take half as much stack again */
+#endif
 #if defined(ARDUINO) && defined(__GNUC__) && !defined(__clang__)
 #pragma GCC optimize("fp-contract=off", "no-math-errno") /* Arduino gives a library no options */
 #endif
-typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];
-#define int64_t int32_t /* counters: no array is so long, and small processors take a tenth less code */
+@NEEDS@#define int64_t int32_t /* counters: no array is so long, and small processors take a tenth less code */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #pragma GCC diagnostic ignored "-Wunused-parameter"
@@ -64,6 +66,7 @@ typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];
 #pragma clang diagnostic ignored "-Wbitwise-instead-of-logical"
 #endif
 """
+NEEDS = "typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];\n"
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class Exported:
     changing: Changing
     name: str
     receding: bool
+    number: int  # bytes of a number: 8 or 4
 
     @property
     def title(self) -> str:
@@ -88,15 +92,17 @@ class Exported:
         return f"{float(torch.as_tensor(self.kept.problem.dynamics.dt).flatten()[0]):g}"
 
     @property
+    def words(self) -> dict[str, Any]:
+        """What files say of its numbers."""
+        near = f"controls within {NEAR:g} of their range"
+        same, real = ("the same bits, status and iterations", "doubles") if self.number == 8 else (near, "floats")
+        return {"SAME": same, "REAL": real}
+
+    @property
     def sizes(self) -> tuple[int, int, int]:
         """Numbers of X, U and K."""
         p = self.kept.problem
         return (p.N + 1) * p.n, p.N * p.m, p.N * p.m * p.n
-
-    @property
-    def stack(self) -> int:
-        """Bytes of stack of a step."""
-        return FRAMES + 8 * MATRICES * (self.kept.problem.n + self.kept.problem.m + 1) ** 2
 
 
 def write_files(exported: Exported, folder: Path, build: Build) -> Path:
@@ -107,17 +113,18 @@ def write_files(exported: Exported, folder: Path, build: Build) -> Path:
         "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
         "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.kept.problem.x0),
         "EXAMPLE": EXAMPLE, "PERIODS": len(periods[2]), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
-        "STACK": exported.stack + SPARE,
+        "STACK": STACK + SPARE,
+        **exported.words,
     }  # fmt: skip
     files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}
     for file, template in TEMPLATES[build].items():
-        tables = {"TABLES": _vectors(*periods)} if template == "test.c" else {}
+        tables = _compared(exported, *periods) if template == "test.c" else {}
         files[file] = _filled(template, exported, **words, **tables)
     files["README.md"] = _readme(exported, words)
     for file, text in files.items():
         path = folder / replaced(file, exported.name)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        path.write_text(single(text) if exported.number == 4 and path.suffix in (".c", ".h", ".ino") else text)
     return folder
 
 
@@ -142,7 +149,7 @@ def _header(exported: Exported) -> str:
     ]
     lam = [f"    double lam_{i}[{count}];" for i, count in exported.solver.multipliers.items()]
     return _filled(
-        "controller.h", exported, TITLE=exported.title, NX=p.n, NU=p.m, N=p.N, DT=exported.stage,
+        "controller.h", exported, **exported.words, TITLE=exported.title, NX=p.n, NU=p.m, N=p.N, DT=exported.stage,
         STAGES=float(exported.receding), STATUSES="\n".join(statuses),
         NUMBERS="\n".join(members) or "    double none; /* no number may change */",
         MAX_ITERATIONS=exported.compiled.interior.max_iterations, SIZE_X=X, SIZE_U=U, SIZE_K=K,
@@ -159,7 +166,10 @@ def _code(exported: Exported) -> str:
     ]
     parts = {"NO_MULTIPLIERS": "\n".join(none) or "    (void)w;", "SHIFTS": "\n".join(shifts)}
     head = HEAD.format(version=VERSION)
-    return replaced(head, exported.name) + solver.solver + replaced(solver.controller, exported.name, **parts)
+    needs = NEEDS if exported.number == 8 else ""
+    return (
+        replaced(head, exported.name, NEEDS=needs) + solver.solver + replaced(solver.controller, exported.name, **parts)
+    )
 
 
 def _periods(exported: Exported) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
@@ -187,15 +197,23 @@ def _periods(exported: Exported) -> tuple[list[np.ndarray], list[np.ndarray], li
     return states, controls, iterations
 
 
-def _vectors(states: list[np.ndarray], controls: list[np.ndarray], iterations: list[int]) -> str:
+def _compared(
+    exported: Exported, states: list[np.ndarray], controls: list[np.ndarray], iterations: list[int]
+) -> dict[str, str]:
+    """What the test compares with, and how: in double precision all bits."""
     flat = lambda rows: [float(value) for row in rows for value in row] or [0.0]
-    return "\n".join(
-        (
-            table("static const double states[]", flat(states)),
-            table("static const double controls[]", flat(controls)),
-            table("static const int iterations[]", iterations or [0]),
-        )
-    )
+    is_double = exported.number == 8
+    near = NEAR * np.ptp(np.array(controls or [np.zeros(exported.kept.problem.m)]), axis=0)
+    tables = [
+        table("static const double states[]", flat(states)),
+        table("static const double controls[]", flat(controls)),
+        table("static const double near[]", [0.0] * len(near) if is_double else near.tolist()),
+        *([table("static const int iterations[]", iterations or [0])] if is_double else []),
+    ]
+    bits = "The bits are those of a processor with fused products, and of -ffp-contract=off."
+    wrong = bits if is_double else "Controls differ by more than rounding in single precision makes them."
+    same = " && workspace.iterations == iterations[k]" if is_double else ""
+    return {"TABLES": "\n".join(tables), "ITERATIONS": same, "OTHERWISE": wrong}
 
 
 def _readme(exported: Exported, words: dict[str, Any]) -> str:
@@ -205,10 +223,10 @@ def _readme(exported: Exported, words: dict[str, Any]) -> str:
     ]
     (X, U, K), lam = exported.sizes, sum(exported.solver.multipliers.values())
     count = sum(m.size for m in exported.changing.members) or 1
-    workspace = 8 * (2 * X + 2 * U + K + lam + count + exported.solver.room) + 64
+    workspace = exported.number * (2 * X + 2 * U + K + lam + count) + 8 * exported.solver.room + 64
     return _filled(
         "README.md", exported, **words, WORKSPACE=f"{workspace:,}", TABLES=f"{exported.solver.flash:,}",
-        BYTES=f"{exported.stack:,}", ROWS="\n".join(rows) or "| | | | | |",
+        BYTES=f"{STACK:,}", ROWS="\n".join(rows) or "| | | | | |",
     )  # fmt: skip
 
 

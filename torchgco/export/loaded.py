@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import platform
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,16 +20,17 @@ from torchgco.base.numbers import Floats, as_floats, measured
 from torchgco.base.options import PositiveOrInfinite, Seconds, check_value
 from torchgco.base.status import Status
 from torchgco.native.compiler import Unit, build
-from torchgco.native.declarations import NUMBERS
 from torchgco.receding.plan import stages_between
 
 BAD_STATE, BAD_NUMBER = -1, -2
 WITHOUT_ERRNO = "-fno-math-errno"
-_MEMBER = re.compile(r"^    (double|int) ([^;]+);(?: /\* ([\d x]+): (\S+) \*/)?", re.MULTILINE)
+# gcc 12.2 -O2 with AVX-512 places arrays of floats in the red zone, below a function's frame, without their alignment.
+WITHOUT_RED_ZONE = ("-mno-red-zone",)
+_MEMBER = re.compile(r"^    (double|float|int) ([^;]+);(?: /\* ([\d x]+): (\S+) \*/)?", re.MULTILINE)
 _ONE, _CLOCK = re.compile(r"(\w+)(?:\[(\d+)\])?"), "double (*clock)(void);"
 _SIZE = re.compile(r"^#define \w+_(NX|NU|N|STAGES) ([\d.]+)(?:.* ([\d.e-]+) s \*/)?", re.MULTILINE)
 _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double)
-_DOUBLES = ctypes.POINTER(ctypes.c_double)
+_KINDS = {"double": ctypes.c_double, "float": ctypes.c_float, "int": ctypes.c_int}
 
 
 def load_c(folder: str | Path, name: str | None = None, period: float | None = None) -> LoadedController:
@@ -73,9 +75,13 @@ class LoadedController:
         self.dt, self._stages = float(sizes["N"][1]), sizes["STAGES"][0]
         self.period = self._stages * self.dt if period is None else check_value(period, Seconds, "period")
         self._shapes, kinds = _layout(header)
+        single = f"float u[{name}_NU]" in header
+        self._dtype: Any = np.float32 if single else np.float64
+        self._real: Any = ctypes.c_float if single else ctypes.c_double
         source = code.replace(f'#include "{name}.h"', header)
         source += f'\n_Static_assert(sizeof({name}_workspace) == {ctypes.sizeof(kinds)}, "layout");\n'
-        library = build((Unit(source, own=True),), (WITHOUT_ERRNO,))
+        flags = (WITHOUT_ERRNO, *(WITHOUT_RED_ZONE if single and platform.machine() in ("x86_64", "AMD64") else ()))
+        library = build((Unit(source, own=True),), flags)
         self._functions = {word: getattr(library, f"{name}_{word}") for word in ("init", "reset", "guess", "step")}
         self._functions["step"].restype = ctypes.c_int
         self._workspace = kinds()
@@ -115,7 +121,7 @@ class LoadedController:
         """States (N+1, n), controls (N, m) and gains (N, m, n) of what is flown, from its first knot on."""
         shapes = {"X": (self.N + 1, self.n), "U": (self.N, self.m), "K": (self.N, self.m, self.n)}
         arrays = (np.array(getattr(self._workspace, name)).reshape(shape) for name, shape in shapes.items())
-        X, U, K = map(torch.from_numpy, arrays)
+        X, U, K = (torch.from_numpy(array).double() for array in arrays)
         return X, U, K
 
     def reset(self) -> None:
@@ -134,8 +140,8 @@ class LoadedController:
             array = np.ascontiguousarray(as_floats(value, name))
             if array.shape != shape:
                 raise InputError(name, f"shape {shape}", array.shape)
-            arrays.append(array)
-        self._functions["guess"](ctypes.byref(self._workspace), *(array.ctypes.data_as(_DOUBLES) for array in arrays))
+            arrays.append(array.astype(self._dtype))
+        self._functions["guess"](ctypes.byref(self._workspace), *map(self._pointer, arrays))
 
     def step(
         self,
@@ -151,7 +157,7 @@ class LoadedController:
         Raises:
             InputError: states, a time or numbers that don't fit. Nothing is changed then.
         """
-        state = np.ascontiguousarray(measured(x, 1, self.n).reshape(self.n))
+        state = np.ascontiguousarray(measured(x, 1, self.n).reshape(self.n), self._dtype)
         later = self.period if t is None else t - self.t
         if t is not None and (not math.isfinite(t) or (self._begun and t <= self.t)):
             raise InputError("t", f"a time after {self.t:g} s", shown(t))
@@ -162,18 +168,19 @@ class LoadedController:
         for name, floats in new.items():
             self._numbers[name][...] = floats
         stages = stages_between(later / self.dt) if self._begun else 0.0
-        u = np.zeros(self.m)
+        u = np.zeros(self.m, self._dtype)
         self.raw_step(state, stages, math.inf if limit is None else limit, u)
         self.t = (self.t + self.period if self._begun else 0.0) if t is None else t
         self._begun = True
-        return torch.from_numpy(u)
+        return torch.from_numpy(u).double()
 
     def raw_step(self, x: Floats, stages: float, max_seconds: float, u: Floats) -> int:
-        """`NAME_step` itself, with states x (n,) and room for controls u (m,); returns what C returns."""
-        pointers = (array.ctypes.data_as(_DOUBLES) for array in (x, u))
-        state, controls = pointers
-        seconds = ctypes.c_double(stages), ctypes.c_double(max_seconds)
-        return int(self._functions["step"](ctypes.byref(self._workspace), state, *seconds, controls))
+        """`NAME_step` itself, with states x (n,) and room for controls u (m,), of C's type; returns what C returns."""
+        times = self._real(stages), ctypes.c_double(max_seconds)
+        return int(self._functions["step"](ctypes.byref(self._workspace), self._pointer(x), *times, self._pointer(u)))
+
+    def _pointer(self, array: np.ndarray) -> Any:
+        return array.ctypes.data_as(ctypes.POINTER(self._real))
 
     def _fitting(self, name: str, value: Any) -> Floats:
         if name not in self._numbers:
@@ -190,15 +197,14 @@ def _layout(header: str) -> tuple[dict[str, tuple[int, ...]], Any]:
     shapes, fields = dict[str, tuple[int, ...]](), list[tuple[str, Any]]()
     for kind, names, shape, _ in _MEMBER.findall(numbers[numbers.index("typedef struct") :]):
         for name, count in _ONE.findall(names):
-            fields.append((name, NUMBERS[kind] * int(count) if count else NUMBERS[kind]))
+            fields.append((name, _KINDS[kind] * int(count) if count else _KINDS[kind]))
             if shape:
                 shapes[name] = tuple(map(int, shape.split(" x ")))
     own: list[tuple[str, Any]] = [("numbers", type("Numbers", (ctypes.Structure,), {"_fields_": fields}))]
     own.append(("clock", _CALLBACK))
     for kind, names, *_ in _MEMBER.findall(workspace.split(_CLOCK, 1)[1]):
-        ctype = ctypes.c_int if kind == "int" else ctypes.c_double
         for name, count in _ONE.findall(names):
-            own.append((name, ctype * int(count) if count else ctype))
+            own.append((name, _KINDS[kind] * int(count) if count else _KINDS[kind]))
     return shapes, type("Workspace", (ctypes.Structure,), {"_fields_": own})
 
 

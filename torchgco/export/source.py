@@ -15,12 +15,15 @@ from torch import Tensor
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.constraints.bounds import LOOSE
 from torchgco.export.numbers import ABOVE_ZERO, AT_LEAST_ZERO, BOUND, Changing, Copies, fixed_radii
+from torchgco.export.single import VIOLATION, options_in_single
+from torchgco.lagrangian.barrier import FILTERED
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
 from torchgco.native.declarations import Structure, defines, kept_by
 from torchgco.native.includes import C
 from torchgco.native.interior import Kept
 from torchgco.native.packing import kind_of
+from torchgco.problem.problem import Problem
 from torchgco.receding.plan import STAGE_ROUNDING
 from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import SADDLE_STEPS, InteriorPoint
@@ -33,10 +36,12 @@ TYPES = {
 # Files of the kernels, and what takes their places.
 REPLACED = {
     "vectors.h": C / "scalar" / "vectors.h", "wide.h": C / "scalar" / "wide.h",
-    "allocation.h": HERE / "arena.h", "clock.h": HERE / "seconds.h",
+    "allocation.h": HERE / "arena.h", "stack.h": HERE / "stack.h", "clock.h": HERE / "seconds.h",
 }  # fmt: skip
 FILES = "riccati.c", "interior.c", "sweep.h", "rollout.h"  # the interior point, sweeps and rollouts
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
+ON_STACK = 128  # numbers of one stage that a step has on the stack, at most: 1 kB
+HELD = 112  # doubles of the structures Barrier and Track, at most, beside the filter
 SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
 
 
@@ -53,11 +58,12 @@ class Writer:
     places: dict[int, str]
     tables: list[str] = field(default_factory=list)
     flash: int = 0  # bytes of tables
+    number: int = 8  # of a number
 
     def table(self, tensor: Tensor) -> str:
         """The name of a constant array with these numbers."""
         name = f"table_{len(self.tables)}"
-        self.flash += tensor.numel() * tensor.element_size()
+        self.flash += tensor.numel() * min(tensor.element_size(), self.number)
         self.tables.append(table(f"static const {TYPES[tensor.dtype]} {name}[]", tensor))
         return name
 
@@ -117,36 +123,37 @@ class Solver:
     flash: int
 
 
-def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest: Tensor) -> Solver:
+def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest: Tensor, number: int) -> Solver:
     """The C of a packed problem.
 
     Args:
         rest: controls (N, m) with which a solve without a guess begins.
+        number: bytes of a number, 8 or 4. The text is of doubles in any case: see `single`.
     """
     problem, how = kept.problem, kept.how
     multipliers = {i: lam.numel() for i, lam in enumerate(kept.lam) if lam.numel() > 0}
-    writer = Writer(kept_by(how), _places(kept, changing, multipliers))
-    made = [_made(kept, j, address, copies) for j, (address, copies) in enumerate(changing.copied.items())]
+    writer = Writer(kept_by(how), _places(kept, changing, multipliers), number=number)
+    made = [_made(kept, j, address, copies, number) for j, (address, copies) in enumerate(changing.copied.items())]
     K = len(problem.constraints)
     rows = [writer.body(row) for row in _constraints(kept)]
     fields = writer.body(kept.packed, constraint="b->constraints", arena="&b->arena")
-    lines = _bound(
-        rows, fields, writer.body(how, of="&b->problem"), changing, made, _rest(kept, changing, writer, rest)
-    )
+    options = writer.body(how, of="&b->problem", **({} if number == 8 else _other_options(interior)))
+    lines = _bound(rows, fields, options, changing, made, _rest(kept, changing, writer, rest))
     count = _count(kept)
-    need = count + (K + 1) * (POINTERS_OF_ROWS + 2)
-    sizes = problem.N + 1, problem.N, problem.n, problem.m
-    room = need + _solve_size(K, sizes, [len(kept_by(how)[address].flatten()) for address in changing.copied])
+    made_numbers = sum(kept_by(how)[address].numel() for address in changing.copied)
+    numbers = count + 2 * FILTERED + _solve_numbers(problem) + made_numbers
+    room = _structures(K) + -(-numbers * number // 8)
     texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
     own = [
-        _constants(interior, bool(K)), "enum { N = NAME_N };", *writer.tables, *(part.tables for part in made),
+        _constants(interior, bool(K), number), "enum { N = NAME_N };", *writer.tables, *(part.tables for part in made),
         _numbers_table(changing), _depths(kept), _structure(K, [part.declared for part in made]),
         _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
     ]  # fmt: skip
-    flash = writer.flash + 8 * sum(m.size for m in changing.members) + sum(part.flash for part in made)
-    solver = kept.engine.form.alone(FILES, texts, declared, KINDS=sum(1 << kind for kind in _kinds(kept)))
+    flash = writer.flash + number * sum(m.size for m in changing.members) + sum(part.flash for part in made)
+    sizes = {"KINDS": sum(1 << kind for kind in _kinds(kept)), "ON_STACK": ON_STACK}
+    solver = kept.engine.form.alone(FILES, texts, declared, **sizes)
     return Solver(solver, "\n".join(own), room, multipliers, flash)
 
 
@@ -170,12 +177,18 @@ def _count(kept: Kept) -> int:
     return int(function(ctypes.byref(kept.how)))
 
 
-def _solve_size(K: int, sizes: tuple[int, int, int, int], made: list[int]) -> int:
-    """The size of the structure Solve in numbers, at most."""
-    knots, N, n, m = sizes
+def _structures(K: int) -> int:
+    """The size of all structures of a step without arrays of numbers, in doubles, at most."""
     size = lambda kind: -(-ctypes.sizeof(kind) // 8)
-    structures = size(c.Interior) + 2 * size(c.Problem) + max(1, K) * size(c.Constraint)
-    return structures + knots * n + 2 * N * m + N * m * (n + 1) + sum(made) + SCALARS
+    own = size(c.Interior) + 2 * size(c.Problem) + max(1, K) * size(c.Constraint)
+    return own + (K + 1) * (POINTERS_OF_ROWS + 2) + HELD + SCALARS
+
+
+def _solve_numbers(problem: Problem) -> int:
+    """How many numbers the arrays of the structure Solve have, but for those that are made."""
+    N, n, m = problem.N, problem.n, problem.m
+    stage = (n + m) * (n + m) + (n + m) * n + m * n
+    return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1)
 
 
 def _places(kept: Kept, changing: Changing, multipliers: dict[int, int]) -> dict[int, str]:
@@ -200,7 +213,7 @@ class Made:
     flash: int
 
 
-def _made(kept: Kept, j: int, address: int, copies: Copies) -> Made:
+def _made(kept: Kept, j: int, address: int, copies: Copies, number: int) -> Made:
     (base,) = (tensor for place, tensor in kept_by(kept.how).items() if place == address)
     size = base.numel()
     tables = [table(f"static const double base_{j}[]", base)]
@@ -219,7 +232,7 @@ def _made(kept: Kept, j: int, address: int, copies: Copies) -> Made:
         lines.append(f"    for (int i = 0; i < {len(copies.to)}; i++) {to} = numbers[source_{j}[i]];")
         if copies.bounds:
             lines.append(f"    for (int i = 0; i < {size}; i++) b->made_{j}[i] = limited(b->made_{j}[i]);")
-    flash = 8 * base.numel() + 4 * (len(copies.to) + len(copies.source))
+    flash = number * base.numel() + 4 * (len(copies.to) + len(copies.source))
     return Made("\n".join(tables), f"    double made_{j}[{size}];", lines, flash)
 
 
@@ -270,10 +283,19 @@ static double limited(double bound) { return bound > LOOSE ? LOOSE : bound < -LO
 """
 
 
-def _constants(interior: InteriorPoint, constrained: bool) -> str:
+def _other_options(interior: InteriorPoint) -> dict[str, str]:
+    """Options that differ in single precision, as C."""
+    options = interior.options(warm=True)
+    pairs = zip(vars(options).items(), vars(options_in_single(options)).values(), strict=True)
+    return {name: literal(new) if isinstance(new, float) else str(new) for (name, old), new in pairs if new != old}
+
+
+def _constants(interior: InteriorPoint, constrained: bool, number: int) -> str:
+    violation = interior.violation_tolerance if number == 8 else max(interior.violation_tolerance, VIOLATION)
     values: dict[str, Any] = {
         "WARM_MU": interior.warm_barrier, "WARM_PUSH": interior.warm_barrier, "COLD_MU": interior.initial_barrier,
-        "COLD_PUSH": interior.bound_push, "VIOLATION": interior.violation_tolerance, "ADMITTED": ADMITTED,
+        "COLD_PUSH": interior.bound_push, "VIOLATION": violation, "ADMITTED": ADMITTED,
+        "LAST_BIT": 2.0**-52 if number == 8 else 2.0**-23,
         "MAX_SOLVE_ITERATIONS": interior.max_iterations, "LOOSE": LOOSE, "CONTACT": CONTACT_FACTOR,
         "STATIONARY": STATIONARY, "CONSTRAINED": int(constrained), "STAGE_ROUNDING": STAGE_ROUNDING,
         "SADDLE_FIRST": SADDLE_STEPS[0], "SADDLE_LAST": SADDLE_STEPS[1],
@@ -321,7 +343,7 @@ def _structure(K: int, made: list[str]) -> str:
 
 
 def _assertion(count: int, K: int) -> str:
-    need = f"{count} * sizeof(double) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t))"
+    need = f"{count} * sizeof(V) + {K + 1} * (sizeof(Rows) + 2 * sizeof(int64_t)) + sizeof(Barrier) + sizeof(Track)"
     return f"typedef char NAME_has_room[sizeof(Solve) + {need} <= sizeof(((NAME_workspace *)0)->room) ? 1 : -1];"
 
 

@@ -188,6 +188,7 @@ def _parser() -> RunParser:
         nargs="*",
         help="numbers that the C may be given between steps; default: all that can",
     )
+    parser.add_argument("--single", action="store_true", help="the C has floats, for processors without doubles")
     builds = list(get_args(Build))
     parser.add_argument(
         "--build", metavar="KIND", choices=builds, help=f"what builds the C: {', '.join(builds)}; default: {builds[0]}"
@@ -205,6 +206,8 @@ def _run(options: argparse.Namespace) -> int:
         return _write_c(options)
     if options.build is not None:
         raise InputError("--build", "none without --c", options.build)
+    if options.single:
+        raise InputError("--single", "none without --c", "one")
     if len(options.run) > 1:
         raise InputError("RUN", "one folder; several words with --c", options.run[1])
     run = Path(options.run[0])
@@ -236,7 +239,9 @@ def _write_c(options: argparse.Namespace) -> int:
     if len(options.layout) > 1 or layout not in ids:
         raise InputError("--layout", f"one of {', '.join(map(str, ids[:20]))}", options.layout[-1])
     problem = vehicle.task(layouts.take(np.array([ids.index(layout)]))).problem
-    written = export_c(problem, options.output or output, name, changes=options.changes, build=options.build or "cmake")
+    dtype = torch.float32 if options.single else torch.float64
+    target, build = options.output or output, options.build or "cmake"
+    written = export_c(problem, target, name, changes=options.changes, build=build, dtype=dtype)
     size = sum(path.stat().st_size for path in written.rglob("*") if path.is_file())
     say(f"{written}: {name}.c, {size / 1e6:.2f} MB")
     return 0

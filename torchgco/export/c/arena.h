@@ -1,11 +1,7 @@
 /* Memory and time of an exported solver: its workspace's. */
 #pragma once
 #include "model.h"
-
-typedef struct {
-    unsigned char *next, *end;
-    double (*seconds)(void); /* NULL: no time passes */
-} Arena;
+#include "stack.h"
 
 static void *take(const Problem *p, size_t bytes) {
     Arena *arena = p->arena;

@@ -2,7 +2,7 @@
 
 static double seconds_of(const void *arena) {
     double (*seconds)(void) = ((const Arena *)arena)->seconds;
-    return seconds ? seconds() : 0.0;
+    return seconds ? seconds() : 0;
 }
 
 static int all_finite(const double *values, int count) {
@@ -133,10 +133,10 @@ static void to_middle(double *z, double lower, double upper) {
 
 /* What a trajectory X, U costs, and by how much it violates the constraints; returns 0 without memory. */
 static int judge(Solve *b, double *X, double *U, double *cost, double *violation) {
-    Lanes lanes, *s = &lanes;
     I caught;
     b->follow.X = X; b->follow.U = U;
     b->arena.next = b->arena_begin;
+    LOCAL(Lanes, s, &b->follow);
     if (!start(s, &b->follow)) return 0;
     enter_iterate(s, 0, 0);
     *violation = swept(s, 0, 0, SET(0.0), &caught).violation;
@@ -160,7 +160,7 @@ static int is_rounding(const double *old, const double *new) {
         double most = 0;
         for (int k = 0; k <= N; k++) if (fabs(old[k * NX + i]) > most) most = fabs(old[k * NX + i]);
         for (int k = 0; k <= N; k++)
-            if (!(fabs(new[k * NX + i] - old[k * NX + i]) <= ROUNDINGS * 0x1p-52 * most)) return 0;
+            if (!(fabs(new[k * NX + i] - old[k * NX + i]) <= ROUNDINGS * LAST_BIT * most)) return 0;
     }
     return 1;
 }
@@ -280,11 +280,11 @@ static double too_deep(const Lanes *s, int64_t i, const V *x) {
 /* Whether the vehicle touches an obstacle at the start. */
 static int starts_inside(Solve *b, const double *x) {
 #if DIM > 0
-    Lanes lanes, *s = &lanes;
     int inside = 0;
     memcpy(b->X, x, NX * sizeof *x);
     b->follow.X = b->X; b->follow.U = b->U;
     b->arena.next = b->arena_begin;
+    LOCAL(Lanes, s, &b->follow);
     if (!start(s, &b->follow)) return 0;
     enter_problem(s, 0, 0);
     for (int64_t i = 0; i < s->of->constraints; i++) {
@@ -343,7 +343,7 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
     }
     if (solved) return CONVERGED;
     for (int i = 0; i < N * NU; i++) if (fabs(b->U[i]) > largest) largest = fabs(b->U[i]);
-    double violation = w->violation <= 0x1p-52 * largest ? 0 : w->violation;
+    double violation = w->violation <= LAST_BIT * largest ? 0 : w->violation;
     int sound = b->cost - b->cost == 0 && violation - violation == 0 && is_finite_rollout(b), status = b->status;
     int fits = sound && violation <= VIOLATION, guess_fits = guess_violation <= VIOLATION;
     int better = guess_fits ? !fits || guess_cost < b->cost : !fits && guess_violation < violation;

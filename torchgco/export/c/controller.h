@@ -1,4 +1,4 @@
-/* NAME: @TITLE@. README.md says how it is used; all numbers are doubles. */
+/* NAME: @TITLE@. README.md says how it is used; all numbers are @REAL@, but times. */
 #ifndef NAME_H
 #define NAME_H
 #include <stdint.h>

@@ -48,7 +48,9 @@ static void infer_sizes(const Barrier *t, OUT size) {
     I open = SET(0.0) != SET(0.0);
     for (int v = 0; v < S; v++) open |= size[v] == SET(0.0);
     if (!any(open)) return;
-    V f[NJ + 1], one[S], moved[S * NX];
+    LOCAL_NUMBERS(t, f, 0, NJ + 1);
+    LOCAL_NUMBERS(t, moved, S * S, S * NX);
+    V one[S];
     model_jacobian(s->X, s->U, model_at(s, 0), s->of->shared, f);
     for (int v = 0; v < S; v++) {
         for (int w = 0; w < S; w++) one[w] = SET(w == v);
@@ -70,11 +72,12 @@ static void infer_sizes(const Barrier *t, OUT size) {
    largest of them: in the guess, in its bounds, and in the step to the minimum of the cost alone. */
 TGCO_LARGE V steepest(const Barrier *t, V *plain) {
     const Lanes *s = &t->lanes;
-    V largest = SET(0.0), zero = SET(0.0), one = SET(1.0), g[S], H[S * S], slope[S], bend[S], size[S];
+    LOCAL_NUMBERS(t, H, 0, S * S);
+    V largest = SET(0.0), zero = SET(0.0), one = SET(1.0), g[S], slope[S], bend[S], size[S];
     for (int v = 0; v < S; v++) slope[v] = bend[v] = size[v] = zero;
     for (int64_t k = 0; k <= s->of->N; k++) {
         IN x = s->X + k * NX; IN u = k < s->of->N ? s->U + k * NU : 0;
-        memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        memset(g, 0, sizeof g); memset(H, 0, S * S * sizeof(V));
         cost_expand(s, k, x, u, g, H);
         for (int v = 0; v < (u ? S : NX); v++) {
             V rises = tgco_fabs(g[v]), bends = tgco_fabs(H[v * S + v]);
@@ -443,8 +446,8 @@ int64_t tgco_room(const Interior *how) { return room_of(how); }
 
 /* Problems first, first + 1, ..., last - 1. Returns 0 without memory. */
 int tgco_interior(const Interior *how, int64_t first, int64_t last) {
-    Barrier barrier, *t = &barrier;
-    Track track, *k = &track;
+    LOCAL(Barrier, t, how->of);
+    LOCAL(Track, k, how->of);
     if (!start_barrier(t, how)) return 0;
     memset(k, 0, sizeof *k);
     I running = SET(0.0) == SET(0.0), fresh = running;

@@ -1,6 +1,7 @@
 /* The interior point's data: constraints are c(x, u) + s = 0 with slacks s > 0, or c(x, u) = 0. */
 #pragma once
 #include "model.h"
+#include "stack.h" /* or export/c/stack.h */
 
 typedef struct {
     Lanes lanes;

@@ -131,7 +131,8 @@ TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
     find_nearby(t);
     for (int near = 1; near >= 0; near--) {
         IN X = near ? s->Xn : s->X; IN U = near ? s->Un : s->U;
-        V z[S], f[NJ + 1];
+        LOCAL_NUMBERS(t, f, 0, NJ + 1);
+        V z[S];
         ask(t, DERIVATIVES, t->live, X, U);
         vary_start(t, z);
         for (int64_t k = 0; k <= p->N; k++) {
@@ -230,10 +231,12 @@ static void square_slopes(const Barrier *t, int64_t k, OUT squares) {
    hold no step yet. */
 TGCO_LARGE void measure_costs(Barrier *t) {
     const Lanes *s = &t->lanes;
-    V g[S], H[S * S], squares[S * NX];
+    LOCAL_NUMBERS(t, H, 0, S * S);
+    LOCAL_NUMBERS(t, squares, S * S, S * NX);
+    V g[S];
     for (int64_t k = s->of->N; k >= 0; k--) {
         int last = k == s->of->N;
-        memset(g, 0, sizeof g); memset(H, 0, sizeof H);
+        memset(g, 0, sizeof g); memset(H, 0, S * S * sizeof(V));
         cost_expand(s, k, s->X + k * NX, last ? 0 : s->U + k * NU, g, H);
         if (!last) square_slopes(t, k, squares);
         for (int v = 0; v < (last ? NX : S); v++) {
@@ -292,7 +295,8 @@ TGCO_LARGE void soften_rows(Barrier *t, I of, V share, IN active) {
     for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
     for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
     if (!some) return;
-    V moves[S], squares[S * NX], zero = SET(0.0), one = SET(1.0);
+    LOCAL_NUMBERS(t, squares, S * S, S * NX);
+    V moves[S], zero = SET(0.0), one = SET(1.0);
     measure_costs(t);
     for (int i = 0; i < NX; i++) {
         moves[i] = t->is_free ? tgco_if(tgco_is(t->is_free[i]) & (t->dx[i] > zero), one / t->dx[i]) : zero;

@@ -104,7 +104,7 @@ TGCO_LARGE V logarithms(const Barrier *t, IN s) {
     int count = 0;
     EACH_ROW(t, 0, q) {
         product *= s[q];
-        if (++count % 8 == 0) {
+        if (++count % TGCO_FACTORS == 0) {
             exponents += tgco_exponent(product);
             product = tgco_mantissa(product);
         }

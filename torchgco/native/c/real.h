@@ -11,9 +11,11 @@
 #if TGCO_IS_DOUBLE
 #define TGCO_EXPONENT 52
 #define TGCO_BIAS 1023
+#define TGCO_FACTORS 8 /* slacks whose product is in range */
 #define TGCO_WHOLE 0x1.8p52 /* adding it leaves the nearest whole number in the lowest bits */
 #else
 #define TGCO_EXPONENT 23
 #define TGCO_BIAS 127
+#define TGCO_FACTORS 1
 #define TGCO_WHOLE 0x1.8p23
 #endif

@@ -29,7 +29,10 @@ static I factor_start(Barrier *t) {
 TGCO_BETWEEN_UNITS I factor(Barrier *t, I open) {
     Lanes *s = &t->lanes;
     int64_t N = s->of->N;
-    V T[S * NX], Q[S * S], Y[NU * NX], pivots[NU];
+    LOCAL_NUMBERS(t, Q, 0, S * S);
+    LOCAL_NUMBERS(t, T, S * S, S * NX);
+    LOCAL_NUMBERS(t, Y, S * S + S * NX, NU * NX);
+    V pivots[NU];
     I good = SET(0.0) == SET(0.0);
     int stops = any(open);
     IN last = t->H + N * S * S;

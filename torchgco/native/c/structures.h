@@ -125,7 +125,8 @@ typedef struct {
     Ask *ask; /* Python, where it computes the functions; else NULL */
     int64_t max_iter, acceptable_iter, watchdog_shortened_iter_trigger, watchdog_trial_iter_max, failures;
     int32_t warm, minimum, max_soc;
-    double tol, constr_viol_tol, acceptable_tol, bound_push, counts, smoothing, seconds;
+    double tol, constr_viol_tol, acceptable_tol, bound_push, counts, smoothing;
+    double seconds;
     double nlp_scaling_obj_target_gradient, constr_mult_init_max, held;
     double barrier_tol_factor, mu_linear_decrease_factor, mu_floor, mu_min, s_max, rounding;
     double tau_min, tau_max, kappa_sigma, theta_max_fact, theta_min_fact, gamma_theta, gamma_phi, eta_phi, delta;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
@@ -128,15 +129,13 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
     outputs = [column]
     if slopes is not None:
         arguments, passed, outputs = f"{arguments}, OUT f", f"{passed}, f", [slopes, column]
-    lines = [
-        calls.emit_staged(f"{name}_entries", inputs, outputs, stages),
-        f"TGCO_APART void {name}({arguments}, OUT H) {{",
-        f"    V e[{max(1, len(upper))}];",
-        f"    {name}_entries({passed}, e);",
-        *(f"    H[{i * size + j}] += e[{k}];" for k, (i, j, _) in enumerate(upper)),
-        "}",
-    ]
-    return "\n".join(lines)
+    entries = calls.emit_staged(f"{name}_entries", inputs, outputs, stages)
+    written, places = f"out{len(outputs) - 1}", [i * size + j for i, j, _ in upper]
+    # They are added where they are found: an array of all of them would be half of a step's stack.
+    end = entries.rindex(f"static inline void {name}_entries")  # stages before it have outputs of their own
+    added = re.sub(rf"\b{written}\[(\d+)\] =", lambda at: f"{written}[{places[int(at[1])]}] +=", entries[end:])
+    head, call = f"TGCO_APART void {name}({arguments}, OUT H) {{", f"    {name}_entries({passed}, H);"
+    return "\n".join([entries[:end] + added, head, call, "}"])
 
 
 def _hessian(total: Any, z: Any, inputs: list[Any], made: Container[int] = ()) -> Any:
