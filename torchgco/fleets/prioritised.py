@@ -1,32 +1,38 @@
-"""Prioritised planning: one vehicle after the other, each among the planned motions of those before it.
+"""Prioritised planning: each vehicle among the planned motions of those before it, with priorities that are found.
 
-M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987). Several orders are planned side by
-side. Vehicles that find no plan move to the front, and their team begins again.
+M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987). A vehicle that finds no plan gets
+priority over all others, as in priority-based search (H. Ma et al., Searching with consistent prioritization for
+multi-agent path finding, 2019), but without going back: it does what it would do alone, and only those that are then in
+its way plan again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import ADMITTED
+from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.guesses import SIDES, bent, in_conflict, late, widths
+from torchgco.fleets.guesses import SIDES, bent
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
 from torchgco.kernels import path_clearance
+from torchgco.obstacles.measured import segment_distance
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.timed import library_for
-from torchgco.search.timed import guesses_along, ways_in_time
-from torchgco.search.timed_scenes import can_search
+from torchgco.roadmap.timed import TimedScene, library_for
+from torchgco.search.timed import guesses_along
+from torchgco.search.timed_scenes import can_search, scene_in_time
+from torchgco.search.timed_scenes import among as scene_among
 from torchgco.solution import Solution
+from torchgco.roadmap.timed import timed_ways
 
-RESTARTS = 3  # of each team
-DELAYS = 0.1, 0.2, 0.4  # of beginning, shares of all stages
-WAYS = 4  # through space and time, of those that no guess serves
+MODE = "all"
+WAYS = 3  # through space and time
+DEARER = 0.5  # share by which ways may cost more than the cheapest, on the lattice
 REPAIRS = 3  # solves among larger others of what touches them between the knots
 BEYOND, MORE = 1.5, 2e-3  # by how much more than it touches they are larger: times, and m
 
@@ -38,10 +44,13 @@ class Prioritised:
         fleet: of which these are.
         forms: of its vehicles.
         of: which of the fleets each team is, (C,).
-        alone: what its vehicles do without the others; with `again` what they do now.
-        orders: in which its vehicles plan, of each team.
+        alone: what its vehicles do without the others.
+        orders: in which some of its vehicles plan, of each team.
         late: whether the time is over.
-        again: the vehicles in `orders` plan again, among the motions of all others; there are no restarts.
+        now: what vehicles do that others plan among from the beginning; None: nothing is known of those that haven't
+            planned.
+        raised: how often vehicles of a team may get priority over all others, at most.
+        level: of each vehicle's priority, (C, V); None: 0.
     """
 
     def __init__(
@@ -52,27 +61,29 @@ class Prioritised:
         alone: Plans,
         orders: Sequence[Sequence[int]],
         late: Callable[[], bool] = lambda: False,
-        again: bool = False,
+        now: Plans | None = None,
+        raised: int = 0,
+        level: Tensor | None = None,
     ) -> None:
         C, V = len(of), fleet.V
         self.fleet, self.forms, self.of, self.alone, self.late = fleet, forms, of, alone, late
         self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
-        self.order = [list(order) for order in orders]
-        self.at, self.restarts = [0] * C, [RESTARTS if again else 0] * C
-        self.plans = alone.take(torch.arange(C))
-        self.known = torch.full((C, V), again)
-        self.off = alone.X[0].new_zeros(C, V)  # by which paths leave the chords that others know, m
-        if again:
-            each = zip(fleet.members, alone.X, alone.U, strict=True)
-            self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
-        self.wide = widths(fleet, in_conflict(fleet, alone))
+        self.left = [list(order) for order in orders]
+        self.raised = [raised] * C
+        self.level = torch.zeros(C, V, dtype=torch.int64) if level is None else level.clone()
+        self.plans = (alone if now is None else now).take(torch.arange(C))
+        self.known = torch.full((C, V), now is not None)
+        self.lost = torch.zeros(C, V, dtype=torch.bool)
+        each = zip(fleet.members, self.plans.X, self.plans.U, strict=True)
+        self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
+        self.scenes: dict[tuple[int, int], TimedScene] = {}
 
     def run(self) -> Plans:
-        """Plans of all teams; vehicles without one are where they would be alone."""
-        while rows := [c for c in range(len(self.of)) if self.at[c] < len(self.order[c])]:
+        """Plans of all teams; vehicles without one are where they were."""
+        while rows := [c for c in range(len(self.of)) if self.left[c]]:
             if self.late():
                 break
-            turn = {c: self.order[c][self.at[c]] for c in rows}
+            turn = {c: self.left[c][0] for c in rows}
             for i in range(len(self.forms)):
                 mine = [c for c in rows if self.form_of[turn[c]][0] == i]
                 if mine:
@@ -84,15 +95,37 @@ class Prioritised:
         turn = _Turn(self, form, teams, vehicles)
         turn.plan()
         for c, v, found in zip(teams.tolist(), vehicles.tolist(), turn.found.tolist(), strict=True):
-            if found or self.restarts[c] >= RESTARTS:
-                self.known[c, v], self.at[c] = True, self.at[c] + 1
-                row, one = torch.tensor([c]), self.fleet.members[v]
-                self.off[c, v] = leaves_chords(one.take(self.of[row]), self.plans.X[v][row], self.plans.U[v][row])[0]
+            if not found and self.raised[c] > 0:
+                self.raised[c] -= 1
+                self.level[c, v] = 1 + self.level[c].amax()
                 continue
-            self.restarts[c] += 1
-            self.order[c].remove(v)
-            self.order[c].insert(0, v)
-            self.known[c], self.at[c] = False, 0
+            self.lost[c, v] = not found
+            self.left[c].pop(0)
+            self.known[c, v] = True
+            row, one = torch.tensor([c]), self.fleet.members[v]
+            self.off[c, v] = leaves_chords(one.take(self.of[row]), self.plans.X[v][row], self.plans.U[v][row])[0]
+            self._send_away(c, v)
+
+    def _send_away(self, c: int, v: int) -> None:
+        """Those of lower priority that are in the way of what a vehicle has planned plan again."""
+        others = self.known[c] & (self.level[c] < self.level[c, v])
+        if bool(others.any()):
+            p = self.fleet.places([x[[c]] for x in self.plans.X])[0]
+            in_way = others & touches(p[v], p, self.fleet.distances[v], self.off[c])
+            self.known[c] &= ~in_way
+            self.left[c] += in_way.nonzero().flatten().tolist()
+
+
+def touches(p: Tensor, others: Tensor, keep: Tensor, off: Tensor) -> Tensor:
+    """Which of other paths (V, K, d) come too close to places p (K, d), (V,) bool.
+
+    Args:
+        keep: the distances that are kept, (V,), m; 0 of those that keep none.
+        off: by how much the paths may leave their chords, (V,), m.
+    """
+    away = others - p
+    at, between = away.norm(dim=-1)[:, 1:].amin(-1), segment_distance(away[:, :-1], away[:, 1:]).amin(-1)
+    return (keep > 0) & ((at < keep - ADMITTED) | (between < CONTACT_FACTOR * keep + off))
 
 
 class _Turn:
@@ -102,8 +135,8 @@ class _Turn:
         self.run, self.among, self.teams, self.vehicles = run, run.forms[form], teams, vehicles
         places = torch.tensor([run.form_of[v][1] for v in vehicles.tolist()])
         self.rows = places * run.fleet.B + run.of[teams]
-        radii = run.fleet.distances[vehicles]
-        there = run.known[teams] & (radii > 0)
+        radii, level = run.fleet.distances[vehicles], run.level[teams]
+        there = run.known[teams] & (radii > 0) & (level >= level.gather(1, vehicles.unsqueeze(1)))
         there[torch.arange(len(teams)), vehicles] = False
         p = run.fleet.places(run.plans.X)[teams].transpose(1, 2)  # (b, N+1, V, d)
         self.p = torch.where(there[:, None, :, None], p, torch.nan)
@@ -119,26 +152,41 @@ class _Turn:
         return torch.isfinite(self.cost)
 
     def plan(self) -> None:
-        """From guesses near those alone, and along ways through space and time where these don't do."""
-        wide, position = self.run.wide[self.teams, self.vehicles], self.among.problem.position
-        guesses = [(self.X, self.U)] + [(bent(self.X, position, side, wide), self.U) for side in SIDES]
-        guesses += [late(self.X, self.U, round(share * self.U.shape[1])) for share in DELAYS]
-        X0, U0 = (torch.cat(parts) for parts in zip(*guesses, strict=True))
-        self._solve(torch.arange(len(self.rows)).repeat(len(guesses)), X0, U0)
-        left = (~self.found).nonzero().flatten()
-        if len(left) == 0 or self.run.late():
+        """As alone where nobody is in the way; else from there, and along ways through space and time."""
+        run = self.run
+        for i, (c, v) in enumerate(zip(self.teams.tolist(), self.vehicles.tolist(), strict=True)):
+            keep = torch.where(self.radii[i].isnan(), 0.0, run.fleet.distances[v])
+            p = self.X[i][:, run.fleet.members[v].position]
+            own = leaves_chords(run.fleet.members[v].take(run.of[[c]]), self.X[[i]], self.U[[i]])
+            if not bool(touches(p, self.p[i].transpose(0, 1), keep, run.off[c] + own).any()):
+                run.plans.put_one(v, torch.tensor([c]), run.alone.take(torch.tensor([c])))
+                self.cost[i] = -torch.inf  # nothing is cheaper
+        left = (self.cost == torch.inf).nonzero().flatten()
+        self.cost[self.cost == -torch.inf] = 0.0
+        if len(left):
+            self._solve(left, self.X[left], self.U[left])
+            if MODE == "guess":
+                left = (~self.found).nonzero().flatten()
+        if len(left) == 0 or run.late():
             return
         problem = self._problem(left)
-        if not self._can_search(problem):
+        if not can_search(problem) or library_for(problem.position.stop - problem.position.start) is None:
+            wide, position = self.radii[left].nan_to_num(0.0).amax(-1), problem.position
+            for side in SIDES:
+                self._solve(left, bent(self.X[left], position, side, wide), self.U[left])
             return
-        ways = ways_in_time(problem, self.X[left], WAYS)
+        ways = timed_ways([self._scene(problem, i, int(b)) for i, b in enumerate(left)], WAYS, DEARER)
         each = torch.tensor([b for b, some in enumerate(ways) for _ in some.points], dtype=torch.int64)
         if len(each):
             X0, U0 = guesses_along(problem, each, ways)
             self._solve(left[each], X0, U0)
 
-    def _can_search(self, problem: Problem) -> bool:
-        return can_search(problem) and library_for(problem.position.stop - problem.position.start) is not None
+    def _scene(self, problem: Problem, i: int, b: int) -> TimedScene:
+        """The lattice of a vehicle, with what is in its way now."""
+        key, one = (int(self.run.of[self.teams[b]]), int(self.vehicles[b])), problem.take(torch.tensor([i]))
+        if key in self.run.scenes:
+            return scene_among(self.run.scenes[key], one)
+        return self.run.scenes.setdefault(key, scene_in_time(one, self.X[b]))
 
     def _problem(self, rows: Tensor, grown: Tensor | float = 0.0) -> Problem:
         radii = self.radii[rows] + (grown.unsqueeze(-1) if isinstance(grown, Tensor) else grown)

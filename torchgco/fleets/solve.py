@@ -25,6 +25,7 @@ from torchgco.fleets.solution import FleetSolution
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet
 from torchgco.problem.known import Known
 
+RAISED = 2  # times
 ORDERS = 4  # in which the vehicles of a fleet plan, side by side
 
 
@@ -95,7 +96,7 @@ def solve_fleet(
         if len(rows := best.open) > 0 and not late():
             orders = [order for number in ids[rows].tolist() for order in _orders(fleet, seed, number)]
             of = rows.repeat_interleave(ORDERS)
-            teams = Prioritised(fleet, forms, of, first.take(of), orders, late).run()
+            teams = Prioritised(fleet, forms, of, first.take(of), orders, late, raised=RAISED * fleet.V).run()
             for i in range(ORDERS):
                 best.offer(rows, teams.take(torch.arange(i, len(of), ORDERS)))
             rows = rows[best.verdict.reached[rows]]
@@ -122,7 +123,7 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
         orders = [(~one).nonzero().flatten().tolist() for one in apart]
         for turned in (False, True):
             some = [order[::-1] if turned else order for order in orders]
-            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, again=True).run())
+            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, plans).run())
         rows = rows[best.verdict.reached[rows]]
         plans = best.plans.take(rows)
 
@@ -134,7 +135,7 @@ def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
     if len(rows) == 0 or late():
         return
     before, orders = best.verdict.cost[rows], [[v] for v in paid[rows].argmax(-1).tolist()]
-    best.offer(rows, Prioritised(best.fleet, forms, rows, best.plans.take(rows), orders, late, again=True).run())
+    best.offer(rows, Prioritised(best.fleet, forms, rows, best.plans.take(rows), orders, late, best.plans.take(rows)).run())
     rows = rows[best.verdict.cost[rows] < before]
     _improve(best, forms, rows, best.plans.take(rows), late)
 
