@@ -9,7 +9,6 @@ its way plan again.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -23,12 +22,10 @@ from torchgco.fleets.verdict import leaves_chords, states_goal
 from torchgco.kernels import path_clearance
 from torchgco.obstacles.measured import segment_distance
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.timed import TimedScene, library_for
+from torchgco.roadmap.timed import library_for, timed_ways
 from torchgco.search.timed import guesses_along
-from torchgco.search.timed_scenes import can_search, scene_in_time
-from torchgco.search.timed_scenes import among as scene_among
+from torchgco.search.timed_scenes import can_search
 from torchgco.solution import Solution
-from torchgco.roadmap.timed import timed_ways
 
 MODE = "all"
 WAYS = 3  # through space and time
@@ -76,7 +73,6 @@ class Prioritised:
         self.lost = torch.zeros(C, V, dtype=torch.bool)
         each = zip(fleet.members, self.plans.X, self.plans.U, strict=True)
         self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
-        self.scenes: dict[tuple[int, int], TimedScene] = {}
 
     def run(self) -> Plans:
         """Plans of all teams; vehicles without one are where they were."""
@@ -175,18 +171,13 @@ class _Turn:
             for side in SIDES:
                 self._solve(left, bent(self.X[left], position, side, wide), self.U[left])
             return
-        ways = timed_ways([self._scene(problem, i, int(b)) for i, b in enumerate(left)], WAYS, DEARER)
+        rows = enumerate(self.rows[left].tolist())
+        each = [self.among.scene(row, problem.take(torch.tensor([i])), self.X[left[i]]) for i, row in rows]
+        ways = timed_ways(each, WAYS, DEARER)
         each = torch.tensor([b for b, some in enumerate(ways) for _ in some.points], dtype=torch.int64)
         if len(each):
             X0, U0 = guesses_along(problem, each, ways)
             self._solve(left[each], X0, U0)
-
-    def _scene(self, problem: Problem, i: int, b: int) -> TimedScene:
-        """The lattice of a vehicle, with what is in its way now."""
-        key, one = (int(self.run.of[self.teams[b]]), int(self.vehicles[b])), problem.take(torch.tensor([i]))
-        if key in self.run.scenes:
-            return scene_among(self.run.scenes[key], one)
-        return self.run.scenes.setdefault(key, scene_in_time(one, self.X[b]))
 
     def _problem(self, rows: Tensor, grown: Tensor | float = 0.0) -> Problem:
         radii = self.radii[rows] + (grown.unsqueeze(-1) if isinstance(grown, Tensor) else grown)
