@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchgco.base.status import Status
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
@@ -27,7 +28,6 @@ from torchgco.search.timed import guesses_along
 from torchgco.search.timed_scenes import can_search
 from torchgco.solution import Solution
 
-MODE = "all"
 WAYS = 3  # through space and time
 DEARER = 0.5  # share by which ways may cost more than the cheapest, on the lattice
 REPAIRS = 3  # solves among larger others of what touches them between the knots
@@ -45,9 +45,8 @@ class Prioritised:
         orders: in which some of its vehicles plan, of each team.
         late: whether the time is over.
         now: what vehicles do that others plan among from the beginning; None: nothing is known of those that haven't
-            planned.
+            planned. Where it is `alone` itself, that is nearly a plan.
         raised: how often vehicles of a team may get priority over all others, at most.
-        level: of each vehicle's priority, (C, V); None: 0.
     """
 
     def __init__(
@@ -60,17 +59,15 @@ class Prioritised:
         late: Callable[[], bool] = lambda: False,
         now: Plans | None = None,
         raised: int = 0,
-        level: Tensor | None = None,
     ) -> None:
         C, V = len(of), fleet.V
         self.fleet, self.forms, self.of, self.alone, self.late = fleet, forms, of, alone, late
         self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
         self.left = [list(order) for order in orders]
         self.raised = [raised] * C
-        self.level = torch.zeros(C, V, dtype=torch.int64) if level is None else level.clone()
+        self.level = torch.zeros(C, V, dtype=torch.int64)  # of each vehicle's priority
         self.plans = (alone if now is None else now).take(torch.arange(C))
-        self.known = torch.full((C, V), now is not None)
-        self.lost = torch.zeros(C, V, dtype=torch.bool)
+        self.is_near, self.known = now is alone, torch.full((C, V), now is not None)
         each = zip(fleet.members, self.plans.X, self.plans.U, strict=True)
         self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
 
@@ -90,12 +87,12 @@ class Prioritised:
         """Plan a vehicle of each of some teams, all of one form."""
         turn = _Turn(self, form, teams, vehicles)
         turn.plan()
-        for c, v, found in zip(teams.tolist(), vehicles.tolist(), turn.found.tolist(), strict=True):
-            if not found and self.raised[c] > 0:
+        may_rise = ~turn.found & ~turn.radii.isnan().all(-1)
+        for c, v, rises in zip(teams.tolist(), vehicles.tolist(), may_rise.tolist(), strict=True):
+            if rises and self.raised[c] > 0:
                 self.raised[c] -= 1
                 self.level[c, v] = 1 + self.level[c].amax()
                 continue
-            self.lost[c, v] = not found
             self.left[c].pop(0)
             self.known[c, v] = True
             row, one = torch.tensor([c]), self.fleet.members[v]
@@ -148,36 +145,42 @@ class _Turn:
         return torch.isfinite(self.cost)
 
     def plan(self) -> None:
-        """As alone where nobody is in the way; else from there, and along ways through space and time."""
-        run = self.run
+        """As alone where nobody is in the way; else along ways through space and time, and from there.
+
+        What serves is the last; what is nearly a plan already is tried first.
+        """
+        self._stay()
+        near = lambda rows: (rows, self.X[rows], self.U[rows])
+        for guesses in (near, self._guesses) if self.run.is_near else (self._guesses, near):
+            left = (~self.found).nonzero().flatten()
+            if len(left) == 0 or self.run.late():
+                return
+            self._solve(*guesses(left))
+
+    def _stay(self) -> None:
+        """Take what vehicles do alone where they have a plan that keeps clear of all others."""
+        run, sound = self.run, torch.tensor([Status.CONVERGED, Status.FEASIBLE])
         for i, (c, v) in enumerate(zip(self.teams.tolist(), self.vehicles.tolist(), strict=True)):
+            own, row, at = run.fleet.members[v].take(run.of[[c]]), torch.tensor([c]), slice(i, i + 1)
             keep = torch.where(self.radii[i].isnan(), 0.0, run.fleet.distances[v])
-            p = self.X[i][:, run.fleet.members[v].position]
-            own = leaves_chords(run.fleet.members[v].take(run.of[[c]]), self.X[[i]], self.U[[i]])
-            if not bool(touches(p, self.p[i].transpose(0, 1), keep, run.off[c] + own).any()):
-                run.plans.put_one(v, torch.tensor([c]), run.alone.take(torch.tensor([c])))
-                self.cost[i] = -torch.inf  # nothing is cheaper
-        left = (self.cost == torch.inf).nonzero().flatten()
-        self.cost[self.cost == -torch.inf] = 0.0
-        if len(left):
-            self._solve(left, self.X[left], self.U[left])
-            if MODE == "guess":
-                left = (~self.found).nonzero().flatten()
-        if len(left) == 0 or run.late():
-            return
-        problem = self._problem(left)
+            off = run.off[c] + leaves_chords(own, self.X[at], self.U[at])
+            clear = ~touches(self.X[i][:, own.position], self.p[i].transpose(0, 1), keep, off).any()
+            if bool(clear) and bool(torch.isin(run.alone.status[c, v], sound)):
+                run.plans.put_one(v, row, run.alone.take(row))
+                self.cost[i] = own.cost.total(self.X[at], self.U[at])[0]
+
+    def _guesses(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Guesses (C, ...) for some of the vehicles, and whose they are, (C,): along ways, or to both sides where none
+        can be looked for."""
+        problem, X, U = self._problem(rows), self.X[rows], self.U[rows]
         if not can_search(problem) or library_for(problem.position.stop - problem.position.start) is None:
-            wide, position = self.radii[left].nan_to_num(0.0).amax(-1), problem.position
-            for side in SIDES:
-                self._solve(left, bent(self.X[left], position, side, wide), self.U[left])
-            return
-        rows = enumerate(self.rows[left].tolist())
-        each = [self.among.scene(row, problem.take(torch.tensor([i])), self.X[left[i]]) for i, row in rows]
-        ways = timed_ways(each, WAYS, DEARER)
-        each = torch.tensor([b for b, some in enumerate(ways) for _ in some.points], dtype=torch.int64)
-        if len(each):
-            X0, U0 = guesses_along(problem, each, ways)
-            self._solve(left[each], X0, U0)
+            wide = self.radii[rows].nan_to_num(0.0).amax(-1)
+            guesses = [bent(X, problem.position, side, wide) for side in SIDES]
+            return rows.repeat(len(guesses)), torch.cat(guesses), U.repeat(len(guesses), 1, 1)
+        each = [(i, row, problem.take(torch.tensor([i]))) for i, row in enumerate(self.rows[rows].tolist())]
+        ways = timed_ways([self.among.scene(row, one, X[i]) for i, row, one in each], WAYS, DEARER)
+        whose = torch.tensor([b for b, some in enumerate(ways) for _ in some.points], dtype=torch.int64)
+        return rows[whose], *guesses_along(problem, whose, ways)
 
     def _problem(self, rows: Tensor, grown: Tensor | float = 0.0) -> Problem:
         radii = self.radii[rows] + (grown.unsqueeze(-1) if isinstance(grown, Tensor) else grown)
@@ -186,7 +189,7 @@ class _Turn:
     def _solve(self, whose: Tensor, X0: Tensor, U0: Tensor) -> None:
         """Keep the cheapest of what guesses (C, ...) of vehicles `whose` (C,) lead to."""
         grown, left = torch.zeros(len(whose), dtype=X0.dtype), torch.arange(len(whose))
-        for _ in range(1 + REPAIRS):
+        for _ in range(1 + REPAIRS if len(left) else 0):
             own = whose[left]
             solution = SOLVER.solve(self._problem(own, grown[left]), U0[left], X0=X0[left])
             fine, touch = arrives(self._problem(own), solution)

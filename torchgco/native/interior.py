@@ -79,34 +79,32 @@ class InteriorKernels:
         sides = {"a": right.a, "b": right.b, "c": right.c}
         sides = {name: part.clone(memory_format=torch.contiguous_format) for name, part in sides.items()}
         left = X.new_zeros(right.a.shape[0], problem.B)
-        costates, definite = self._factored(
-            problem, X, U, multipliers, active, give, K, **sides, left=left, count=len(left), responses=None, first=0, d=0
-        )
+        asked: dict[str, Any] = {"left": left, "count": len(left), "responses": None, "first": 0, "d": 0}
+        costates, definite = self._factored(problem, X, U, multipliers, active, give, K, asked | sides)
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, definite)
 
     def responses(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, K: Tensor,
         states: slice,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Of some states at knots 1..N to forces there, (B, N d, N d), and whether the minimum is strict, (B,): float64.
+        """Responses of some states at knots 1..N to forces there, (B, N d, N d), and whether minima are strict, (B,).
 
-        Args:
-            others: as of `kkt`; rows that hold give way by a share of about 1 / `STIFF`.
+        As of `kkt`, but rows that hold give way by a share of about 1 / `STIFF`; float64 on the CPU.
         """
         d = states.stop - states.start
         found, none = X.new_zeros(problem.B, problem.N * d, problem.N * d), X.new_zeros(0)
-        _, definite = self._factored(
-            problem, X, U, multipliers, active, None, K, a=none, b=none, c=none, left=none, count=0, responses=found,
-            first=states.start, d=d,
-        )  # fmt: skip
+        asked: dict[str, Any] = {"responses": found, "first": states.start, "d": d, "count": 0}
+        asked |= dict.fromkeys(("a", "b", "c", "left"), none)
+        _, definite = self._factored(problem, X, U, multipliers, active, None, K, asked)
         return found, definite
 
     def _factored(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
-        give: Tensor | None, K: Tensor | None, **asked: Any,
+        give: Tensor | None, K: Tensor | None, asked: dict[str, Any],
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Costates, and where the factors exist, of what is asked of the systems."""
-        packed, out = self._packed(problem, X.contiguous(), U.contiguous(), tuple(lam.contiguous() for lam in multipliers))
+        multipliers = tuple(lam.contiguous() for lam in multipliers)
+        packed, out = self._packed(problem, X.contiguous(), U.contiguous(), multipliers)
         costates = X.new_zeros(problem.B, problem.N + 1, problem.n)
         how = Kkt.complete(
             of=packed, active=active.double().contiguous(), give=give, K=None if K is None else K.contiguous(),
