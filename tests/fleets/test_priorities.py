@@ -27,14 +27,15 @@ from torchgco.sensitivity.points import rows_that_hold, solve_at
 ONE = torch.tensor([0])
 
 
-def in_the_door() -> Fleet:
-    """The first comes to rest in a door before the second can be there."""
-    walls = Boxes([[0.0, 2.5], [0.0, -2.5]], [[0.1, 2.0], [0.1, 2.0]], 0.2)
-    return Fleet([disc([-1.0, 0.0], [0.0, 0.0], walls), disc([2.5, 0.1], [-2.5, 0.1], walls)], 0.4)
+def in_the_door(*starts: float) -> Fleet:
+    """The first comes to rest in a door before the second can be there; fleets differ in where the second starts."""
+    walls, B = Boxes([[0.0, 2.5], [0.0, -2.5]], [[0.1, 2.0], [0.1, 2.0]], 0.2), len(starts)
+    first = disc([[-1.0, 0.0]] * B, [[0.0, 0.0]] * B, walls)
+    return Fleet([first, disc([[x, 0.1] for x in starts], [[-2.5, 0.1]] * B, walls)], 0.4)
 
 
 def test_who_finds_no_plan_gets_priority_and_others_wait() -> None:
-    fleet = in_the_door()
+    fleet = in_the_door(2.5)
     first = alone(fleet, torchgco.solve, 0, ONE, "gco")
     forms = [Among(problem, Known()) for problem, _ in fleet.forms]
     for raised, sound in ((0, False), (1, True)):
@@ -44,6 +45,18 @@ def test_who_finds_no_plan_gets_priority_and_others_wait() -> None:
         assert run.level.tolist() == [[0, raised]]
     assert torch.equal(run.plans.U[1], first.U[1])  # does as alone
     assert not torch.equal(run.plans.U[0], first.U[0])
+
+
+def test_priorities_do_not_depend_on_other_fleets() -> None:
+    whole, found = in_the_door(2.5, 2.2), []
+    for fleet, ids in ((whole, torch.arange(2)), (whole.take([1]), torch.tensor([1]))):
+        first = alone(fleet, torchgco.solve, 0, ids, torchgco.InteriorPoint())
+        best, forms = solve._Best(fleet, first), [Among(problem, Known()) for problem, _ in fleet.forms]
+        solve._one_after_other(best, forms, torch.arange(fleet.B), 0, ids, lambda: False)
+        found.append(best)
+    assert bool(found[0].verdict.reached.all())
+    for mine, yours in zip(found[1].plans.U, found[0].plans.U, strict=True):
+        assert torch.equal(mine[0], yours[1])
 
 
 def test_who_is_alone_in_the_way_does_not_rise_for_ever() -> None:
@@ -90,7 +103,7 @@ def test_orders_are_drawn_as_long_as_they_matter(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_lattice_that_is_kept_sees_what_is_there_now() -> None:
-    fleet = in_the_door()
+    fleet = in_the_door(2.5)
     (problem, _), *_ = fleet.forms
     among = Among(problem, Known())
     free = open_loop(DISC, problem.x0[:1], torch.zeros(1, 50, 2, dtype=D))
