@@ -16,7 +16,7 @@ from tests.view.test_packing import part
 from torchgco import Boxes, Fleet, FreeTime, FunctionDynamics, InputError, Moved, Problem, Spheres, judge
 from torchgco.fleets.among import Among
 from torchgco.fleets.fleet import _forms
-from torchgco.fleets.guesses import bent, in_conflict, late, widths
+from torchgco.fleets.guesses import bent, in_conflict, widths
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.prioritised import Prioritised
 from torchgco.fleets.solve import alone
@@ -162,15 +162,12 @@ def test_two_that_pass_between_the_knots_are_seen() -> None:
     assert verdict.apart.tolist() == [[False, False]] and all(bool(one.feasible[0]) for one in verdict.vehicles)
 
 
-def test_guesses_bend_to_one_side_and_wait() -> None:
+def test_guesses_bend_to_one_side() -> None:
     problem = disc([0.0, 0.0], [4.0, 0.0])
     X = torch.zeros(1, 51, 4, dtype=D)
     X[..., 0] = torch.linspace(0, 4, 51)
     right = bent(X, slice(0, 2), 1.0, torch.tensor([0.5], dtype=D))
     assert torch.allclose(right[0, [0, -1]], X[0, [0, -1]]) and float(right[0, 25, 1]) == pytest.approx(-0.5)
-    U = torch.arange(50, dtype=D).view(1, 50, 1).expand(1, 50, 2)
-    later = late(X, U, 10)
-    assert torch.equal(later[0][:, 10:], X[:, :41]) and bool((later[1][:, :11] == 0).all())
     fleet = Fleet([problem, disc([4.0, 0.0], [0.0, 0.0]), disc([0.0, 3.0], [4.0, 3.0])], 0.4)
     conflicts = in_conflict(fleet, alone(fleet, torchgco.solve, 0, torch.arange(1), "gco"))
     assert conflicts.tolist() == [[True, True, False]]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
+from torchgco.roadmap.timed import TimedScene
+from torchgco.search.timed_scenes import among, scene_in_time
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
@@ -34,6 +36,7 @@ class Among:
 
     problem: Problem
     known: Known
+    scenes: dict[int, TimedScene] = field(default_factory=dict)  # lattices of problems at some rows
 
     def at(
         self,
@@ -57,6 +60,17 @@ class Among:
         parts = [part for part in one.constraints if not part.is_goal]
         goals = [part for part in one.constraints if part.is_goal]
         return one._with({"constraints": (*parts, others, *goals)}, known=self.known)
+
+    def scene(self, row: int, problem: Problem, free: Tensor) -> TimedScene:
+        """The lattice of the problem at a row with what is in its way now.
+
+        Args:
+            problem: a batch of one.
+            free: states (N+1, n) of it alone.
+        """
+        if row in self.scenes:
+            return among(self.scenes[row], problem)
+        return self.scenes.setdefault(row, scene_in_time(problem, free))
 
     @property
     def place(self) -> int:

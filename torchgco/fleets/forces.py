@@ -10,13 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchgco.lagrangian.kkt import RightSides
+from torchgco.kernels import interior_of
 from torchgco.problem.problem import Problem
-from torchgco.sensitivity.points import rows_that_hold, solve_at
+from torchgco.sensitivity.points import gains_of, rows_that_hold
 from torchgco.solution import Solution
 
 TINY = 1e-9  # m, below which two places are one
-AT_ONCE = 64  # problems whose responses are computed together
 SOFT = 1e-6  # share of the responses by which pairs give way: rows that depend on each other have no unique forces
 STEPS = 40  # of the interior point on forces, at most
 ENOUGH = 1e-8  # product of force and gap at its end, as a share of the first one
@@ -127,18 +126,7 @@ def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
 
 def responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
     """Of places at knots 1..N to forces there, (B, N d, N d), m per unit; NaN where the minimum isn't strict."""
-    parts = torch.arange(problem.B).split(AT_ONCE)
-    return torch.cat([_responses(problem.take(rows), solution.take(rows), position) for rows in parts])
-
-
-def _responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
     holds, _ = rows_that_hold(problem, solution)
-    B, N, n, d = problem.B, problem.N, problem.n, position.stop - position.start
-    a = solution.X.new_zeros(N, d, B, N + 1, n + problem.m)
-    for k in range(N):
-        for axis in range(d):
-            a[k, axis, :, k + 1, position.start + axis] = -1.0
-    gaps, none = a.new_zeros(()).expand(N * d, B, N, n), a.new_zeros(()).expand(N * d, B, holds.shape[1])
-    found = solve_at(problem, solution, holds, RightSides(a.flatten(0, 1), gaps, none))
-    moved = found.z[:, :, 1:, position].permute(1, 2, 3, 0).flatten(1, 2)
-    return torch.where(found.definite.view(-1, 1, 1), moved, torch.nan)
+    point = solution.X, solution.U, solution.multipliers.lam
+    found, strict = interior_of(problem).responses(problem, *point, holds, gains_of(problem, solution), position)
+    return torch.where(strict.view(-1, 1, 1), found, torch.nan)

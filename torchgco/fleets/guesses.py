@@ -1,4 +1,4 @@
-"""Guesses that get vehicles out of each other's way: all bend to the same side, as on a roundabout, or one waits."""
+"""Guesses that get vehicles out of each other's way: all bend to the same side, as on a roundabout."""
 
 from __future__ import annotations
 
@@ -97,12 +97,6 @@ def together(fleet: Fleet, plans: Plans, conflicts: Tensor) -> Plans:
         moved = at(k - 1) * (1.0 - part) + at(k) * part
         kept.X[v] = torch.where(conflicts[:, v].view(-1, 1, 1), moved, plans.X[v])
     return kept
-
-
-def late(X: Tensor, U: Tensor, stages: int) -> tuple[Tensor, Tensor]:
-    """Trajectories X (B, N+1, n), U (B, N, m) that begin some stages later, and end where they are then."""
-    held = (torch.cat((z[:, :1].expand(-1, stages, -1), z[:, : z.shape[1] - stages]), dim=1) for z in (X, U))
-    return next(held), next(held)
 
 
 def in_conflict(fleet: Fleet, plans: Plans) -> Tensor:

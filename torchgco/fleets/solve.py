@@ -25,14 +25,16 @@ from torchgco.fleets.solution import FleetSolution
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet
 from torchgco.problem.known import Known
 
-ORDERS = 4  # in which the vehicles of a fleet plan, side by side
+ORDERS = 2  # times two orders in which the vehicles of a fleet plan, at most
+SAME = 0.02  # share by which the costs of two orders may differ: then others are no better
+RAISED = 2  # times as often as there are vehicles, one gets priority over all others, at most
 
 
 class _Best:
     """The best plans of every fleet so far."""
 
     def __init__(self, fleet: Fleet, plans: Plans) -> None:
-        self.fleet, self.plans = fleet, plans
+        self.fleet, self.alone, self.plans = fleet, plans, plans.take(torch.arange(fleet.B))
         self.verdict = judge_fleet(fleet, plans.U)
         self.least = self.costs  # (B, V), of vehicles alone
         self.lost = torch.isin(plans.status, torch.tensor([Status.INVALID_START, Status.NON_FINITE])).any(-1)
@@ -47,8 +49,8 @@ class _Best:
         """Fleets that aren't sound yet, and can be: all of their vehicles have a start and a plan, (b,)."""
         return (~self.verdict.reached & ~self.lost).nonzero().flatten()
 
-    def offer(self, rows: Tensor, plans: Plans) -> None:
-        """Keep plans of some fleets where they are better: sound, else closer to that, else cheaper."""
+    def offer(self, rows: Tensor, plans: Plans) -> FleetVerdict:
+        """Keep plans of some fleets where they are better: sound, else closer to that, else cheaper; what they are."""
         verdict = judge_fleet(self.fleet.take(rows.tolist()), plans.U)
         new, old = _rank(verdict), _rank(self.verdict, rows)
         better = torch.zeros_like(rows, dtype=torch.bool)
@@ -59,6 +61,7 @@ class _Best:
         places = better.nonzero().flatten()
         self.plans.put(rows[places], plans.take(places))
         put(self.verdict, rows[places], take(verdict, places))
+        return verdict
 
 
 def _rank(verdict: FleetVerdict, rows: Tensor | None = None) -> list[Tensor]:
@@ -85,7 +88,7 @@ def solve_fleet(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
-        best, forms = _Best(fleet, first.take(torch.arange(fleet.B))), [Among(one, Known()) for one, _ in fleet.forms]
+        best, forms = _Best(fleet, first), [Among(one, Known()) for one, _ in fleet.forms]
         for side in SIDES:
             if len(rows := best.open) > 0 and not late():
                 apart = ComingApart(fleet, forms, rows, aside(fleet, forms, rows, first.take(rows), side), late)
@@ -93,15 +96,28 @@ def solve_fleet(
                 near = apart.near.nonzero().flatten()
                 _improve(best, forms, rows[near], plans.take(near), late)
         if len(rows := best.open) > 0 and not late():
-            orders = [order for number in ids[rows].tolist() for order in _orders(fleet, seed, number)]
-            of = rows.repeat_interleave(ORDERS)
-            teams = Prioritised(fleet, forms, of, first.take(of), orders, late).run()
-            for i in range(ORDERS):
-                best.offer(rows, teams.take(torch.arange(i, len(of), ORDERS)))
+            _one_after_other(best, forms, rows, seed, ids, late)
             rows = rows[best.verdict.reached[rows]]
             _improve(best, forms, rows, best.plans.take(rows), late)
         _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
+
+
+def _one_after_other(
+    best: _Best, forms: list[Among], rows: Tensor, seed: int, ids: Tensor, late: Callable[[], bool]
+) -> None:
+    """Offer plans of prioritised planning in drawn orders, two at once: as long as orders matter, or none is sound."""
+    rngs = {b: np.random.default_rng((seed, int(ids[b]))) for b in rows.tolist()}
+    for _ in range(ORDERS):
+        if len(rows) == 0 or late():
+            return
+        of = rows.repeat_interleave(2)
+        orders = [rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
+        first, most = best.alone.take(of), RAISED * best.fleet.V
+        teams = Prioritised(best.fleet, forms, of, first, orders, late, raised=most).run()
+        pair = [best.offer(rows, teams.take(torch.arange(i, len(of), 2))) for i in range(2)]
+        same = (pair[0].cost - pair[1].cost).abs() <= SAME * pair[0].cost.abs()
+        rows = rows[~(same & pair[0].reached & pair[1].reached)]
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
@@ -122,7 +138,7 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
         orders = [(~one).nonzero().flatten().tolist() for one in apart]
         for turned in (False, True):
             some = [order[::-1] if turned else order for order in orders]
-            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, again=True).run())
+            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, plans).run())
         rows = rows[best.verdict.reached[rows]]
         plans = best.plans.take(rows)
 
@@ -134,15 +150,10 @@ def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
     if len(rows) == 0 or late():
         return
     before, orders = best.verdict.cost[rows], [[v] for v in paid[rows].argmax(-1).tolist()]
-    best.offer(rows, Prioritised(best.fleet, forms, rows, best.plans.take(rows), orders, late, again=True).run())
+    first, now = best.alone.take(rows), best.plans.take(rows)
+    best.offer(rows, Prioritised(best.fleet, forms, rows, first, orders, late, now).run())
     rows = rows[best.verdict.cost[rows] < before]
     _improve(best, forms, rows, best.plans.take(rows), late)
-
-
-def _orders(fleet: Fleet, seed: int, number: int) -> list[list[int]]:
-    """Orders of a fleet's vehicles."""
-    rng = np.random.default_rng((seed, number))
-    return [rng.permutation(fleet.V).tolist() for _ in range(ORDERS)]
 
 
 def _late(ends: float | None) -> bool:

@@ -76,19 +76,43 @@ class InteriorKernels:
             give: D (B, R) of the rows that hold; None: 0.
             K: gains (B, N, m, n), with which unstable dynamics don't magnify the rounding of costates; None: 0.
         """
-        B, n = problem.B, problem.n
-        multipliers = tuple(lam.contiguous() for lam in multipliers)
-        packed, out = self._packed(problem, X.contiguous(), U.contiguous(), multipliers)
         sides = {"a": right.a, "b": right.b, "c": right.c}
         sides = {name: part.clone(memory_format=torch.contiguous_format) for name, part in sides.items()}
-        costates, left = X.new_zeros(B, problem.N + 1, n), X.new_zeros(right.a.shape[0], B)
+        left = X.new_zeros(right.a.shape[0], problem.B)
+        asked: dict[str, Any] = {"left": left, "count": len(left), "responses": None, "first": 0, "d": 0}
+        costates, definite = self._factored(problem, X, U, multipliers, active, give, K, asked | sides)
+        return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, definite)
+
+    def responses(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, K: Tensor,
+        states: slice,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Responses of some states at knots 1..N to forces there, (B, N d, N d), and whether minima are strict, (B,).
+
+        As of `kkt`, but rows that hold give way by a share of about 1 / `STIFF`; float64 on the CPU.
+        """
+        d = states.stop - states.start
+        found, none = X.new_zeros(problem.B, problem.N * d, problem.N * d), X.new_zeros(0)
+        asked: dict[str, Any] = {"responses": found, "first": states.start, "d": d, "count": 0}
+        asked |= dict.fromkeys(("a", "b", "c", "left"), none)
+        _, definite = self._factored(problem, X, U, multipliers, active, None, K, asked)
+        return found, definite
+
+    def _factored(
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor,
+        give: Tensor | None, K: Tensor | None, asked: dict[str, Any],
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Costates, and where the factors exist, of what is asked of the systems."""
+        multipliers = tuple(lam.contiguous() for lam in multipliers)
+        packed, out = self._packed(problem, X.contiguous(), U.contiguous(), multipliers)
+        costates = X.new_zeros(problem.B, problem.N + 1, problem.n)
         how = Kkt.complete(
             of=packed, active=active.double().contiguous(), give=give, K=None if K is None else K.contiguous(),
-            y=costates, left=left, **sides, problems=B, free_start=free_components(problem), count=right.a.shape[0],
-            rounds=CLOSING_ROUNDS, stiff=STIFF, slight=SLIGHT, pivot=LEAST_PIVOT, ask=None,
+            y=costates, problems=problem.B, free_start=free_components(problem), rounds=CLOSING_ROUNDS, stiff=STIFF,
+            slight=SLIGHT, pivot=LEAST_PIVOT, ask=None, **asked,
         )  # fmt: skip
         self._run(self.library.tgco_kkt, problem, how)
-        return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, out["status"] == Status.CONVERGED)
+        return costates, out["status"] == Status.CONVERGED
 
     def _packed(
         self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...]

@@ -258,12 +258,15 @@ class MovingBoxes(OwnKind):
     def chord_clearance(self, X: Tensor, share: float | None = None) -> Tensor:
         k = torch.arange(X.shape[1], dtype=X.dtype, device=X.device)
         k = k if self.stops is None else torch.minimum(k, self.stops.unsqueeze(-1))
-        local = torch.stack(self._local(X[..., self.position], k * self.dt), dim=-1)
-        begin, along = local[:, :-1].unbind(-1), local.diff(dim=1).unbind(-1)
-        gap = segment_distance(begin, along, self._solids.halves())
+        gap = self._chords(self._away(X[..., self.position], k * self.dt))
         gap = gap if self.bulge is None else gap - self.bulge.unsqueeze(1)
         gap = gap + (self.beneath(share) - self.boxes.inflated_radii).unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
+
+    def _chords(self, away: Tensor) -> Tensor:
+        """Distances (B, K-1, M) of the segments between relative places (B, K, M, d) from boxes that aren't rounded."""
+        local = torch.stack(self._solids.local(away.unbind(-1)), dim=-1)
+        return segment_distance(local[:, :-1].unbind(-1), local.diff(dim=1).unbind(-1), self._solids.halves())
 
     def solids_at(self, t: Tensor) -> Cuboids:
         return replace(self._solids, centers=self.centers_at(t)[0])

@@ -21,6 +21,7 @@ from torchgco.obstacles.boxes import BoundBoxes, MovingBoxes
 from torchgco.obstacles.inputs import check_sides, dimension, is_body, own_axes, own_radii, rows
 from torchgco.obstacles.measured import Distances, box_distances, sphere_distances
 from torchgco.obstacles.shapes import RoundedBoxes, array
+from torchgco.obstacles.spheres import from_origin
 
 NEAR_KNOT = 1e-9  # of a step: so near to a knot is at it
 
@@ -142,6 +143,9 @@ class MovedSpheres(MovedBoxes):
 
     def slopes(self, p: Tensor, t: Tensor) -> Tensor:
         return -2.0 * self._away(p, t)
+
+    def _chords(self, away: Tensor) -> Tensor:
+        return from_origin(away[:, :-1], away.diff(dim=1))
 
     def measured(self, X: Tensor) -> Distances:
         return sphere_distances(self._measured_from(X), self.boxes.inflated_radii, self.absent)

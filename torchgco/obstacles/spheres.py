@@ -156,7 +156,7 @@ class BoundSpheres(OwnKind):
 
     def segment_clearance(self, a: Tensor, b: Tensor) -> Tensor:
         o = self.centers.unsqueeze(1)
-        gap = _from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.inflated_radii.unsqueeze(1)
+        gap = from_origin(a.unsqueeze(2) - o, (b - a).unsqueeze(2)) - self.inflated_radii.unsqueeze(1)
         return torch.where(self.absent.unsqueeze(1), torch.inf, gap)
 
     def measured(self, X: Tensor) -> Distances:
@@ -249,7 +249,7 @@ class BoundSpheres(OwnKind):
             o = o + (t * self.dt)[..., None, None] * self.velocities.unsqueeze(1)
         away = X[:, :, None, self.position] - o
         contact = 1.0 - (TOUCH if share is None else share)
-        gap = _from_origin(away[:, :-1], away.diff(dim=1)) - contact * self.inflated_radii.unsqueeze(1)
+        gap = from_origin(away[:, :-1], away.diff(dim=1)) - contact * self.inflated_radii.unsqueeze(1)
         return least(torch.where(self.absent.unsqueeze(1), torch.inf, gap))
 
     def _gaps(self, p: Tensor, t: Tensor) -> Tensor:
@@ -383,7 +383,7 @@ class SpheresInFreeTime(Obstacles):
         return torch.where(there, self.spheres.inflated_radii, 1.0), there.to(self.spheres.centers.dtype)
 
 
-def _from_origin(a: Tensor, along: Tensor) -> Tensor:
+def from_origin(a: Tensor, along: Tensor) -> Tensor:
     """Distances (...) of the origin from segments that begin at a and go along, (..., d)."""
     length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
     nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along

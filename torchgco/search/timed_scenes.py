@@ -254,6 +254,11 @@ def scene_in_time(problem: Problem, free: Tensor, finer: float = 1.0, span: Span
     )  # fmt: skip
 
 
+def among(scene: TimedScene, problem: Problem) -> TimedScene:
+    """A scene with the obstacles of another batch of one, which differs in these alone."""
+    return replace(scene, field=field_of(_with_distances(problem), scene.lattice))
+
+
 def _costs(values: Array) -> Tensor:
     """Costs for C: those that aren't finite are `FAR`."""
     return torch.from_numpy(np.nan_to_num(values, nan=FAR, posinf=FAR, neginf=FAR)).float().contiguous()

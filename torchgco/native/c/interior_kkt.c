@@ -10,6 +10,7 @@
    round closes what the last one has left open, of active rows all but a share of about 1 / sigma, as the method of
    multipliers does. */
 #include "interior_fixed.h"
+#include "cholesky.h"
 
 #define LEAST 1e-200 /* multiplier of an active row of an inequality, by which its stiffness is divided */
 
@@ -135,6 +136,49 @@ TGCO_LARGE V solve_kkt(Barrier *t, System *of, int64_t rounds) {
     return worst;
 }
 
+/* Columns (count, NX) of changes of the state at knot k, carried to the next knot by what the gains make of the controls. */
+static void carry(const Barrier *t, int64_t k, OUT columns, int64_t count) {
+    IN K = t->lanes.G + k * NU * NZ;
+    V z[S];
+    for (OUT x = columns; x < columns + count * NX; x += NX) {
+        for (int i = 0; i < NX; i++) z[i] = x[i];
+        for (int j = 0; j < NU; j++) {
+            z[NX + j] = SET(0.0);
+            for (int i = 0; i < NX; i++) ADD(z[NX + j], K[j * NZ + i], x[i]);
+        }
+        model_push(t->f + k * NJ, z, x);
+    }
+}
+
+/* Responses to forces: the inverse of the matrix that was factored is the covariance of states that follow the gains, with
+   controls disturbed by the inverse of their own curvature L L'. */
+TGCO_LARGE void find_responses(const Barrier *t, const Kkt *how, int64_t at, int own) {
+    int64_t N = t->lanes.of->N, d = how->d, width = N * d;
+    V spread[NX * NX], turned[NX * NX], z[S], pushed[NX];
+    memset(spread, 0, sizeof spread);
+    for (int64_t k = 0; k < N; k++) {
+        carry(t, k, spread, NX);
+        for (int i = 0; i < NX; i++) for (int j = 0; j < NX; j++) turned[i * NX + j] = spread[j * NX + i];
+        carry(t, k, turned, NX);
+        memcpy(spread, turned, sizeof spread);
+        for (int j = 0; j < NU; j++) {
+            for (int i = 0; i < S; i++) z[i] = SET(i == NX + j ? 1.0 : 0.0);
+            solve_upper(t->L + k * NU * NU, z + NX, 1, 1);
+            model_push(t->f + k * NJ, z, pushed);
+            for (int a = 0; a < NX; a++) for (int b = 0; b < NX; b++) ADD(spread[a * NX + b], pushed[a], pushed[b]);
+        }
+        memcpy(turned, spread + how->first * NX, d * NX * sizeof(V));
+        for (int64_t l = k; l < N; l++) {
+            if (l > k) carry(t, l, turned, d);
+            for (int64_t a = 0; a < d; a++) for (int64_t b = 0; b < d; b++) for (int lane = 0; lane < own; lane++) {
+                double *out = how->responses + (at + lane) * width * width;
+                out[(l * d + b) * width + k * d + a] = out[(k * d + a) * width + l * d + b] =
+                    LANE(turned[a * NX + how->first + b], lane);
+            }
+        }
+    }
+}
+
 /* Reads or writes one right hand side of a lane: (count, E, ...) each. */
 #define COLUMN(how, name, column, e, size) ((how)->name + ((column) * (how)->problems + (e)) * (size))
 
@@ -213,6 +257,7 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
             p->status[at + l] = LANE(good, l) ? CONVERGED : NOT_POSITIVE_DEFINITE;
             for (int64_t i = 0; i < (p->N + 1) * NX; i++) how->y[(at + l) * (p->N + 1) * NX + i] = LANE(t->y[i], l);
         }
+        if (how->responses) find_responses(t, how, at, own);
         for (int64_t column = 0; column < how->count; column++) {
             for (int l = 0; l < LANES; l++) enter_column(t, of, how, column, l, l < own ? at + l : at);
             V left = solve_kkt(t, of, how->rounds);

@@ -147,6 +147,7 @@ typedef struct {
     Ask *ask; /* as in Interior */
     double *a, *b, *c; /* (C, E, N+1, S), (C, E, N, NX), (C, E, R): right hand sides in, z, y, v out */
     double *y, *left; /* (E, N+1, NX): costates; (C, E): largest of what active rows leave open */
-    int64_t problems, count, rounds; /* E, C */
+    double *responses; /* (E, N d, N d): of d states from `first` on at knots 1..N to forces there; NULL: none are asked */
+    int64_t problems, count, rounds, first, d; /* E, C */
     double stiff, slight, pivot;
 } Kkt;
