@@ -28,6 +28,7 @@ from torchgco import (
 )
 from torchgco.api import _guess
 from torchgco.baselines import CasADiSolver
+from torchgco.constraints.norms import TIP
 from torchgco.kernels import EagerWarning, measured
 
 D = torch.float64
@@ -225,6 +226,25 @@ def test_a_way_may_end_at_the_tip_of_its_cone() -> None:
     found = torchgco.solve(problem, solver=InteriorPoint())
     assert found.statuses == [Status.CONVERGED] * B and float(found.violation.max()) < 1e-6
     assert int(found.iterations.max()) < 250
+
+
+def test_where_the_best_is_the_tip_itself_solves_end_converged() -> None:
+    """Pulled out behind its tip, the best of a cone is the tip: 32 drawn axes, angles and pulls, by a closed form."""
+    draw = np.random.default_rng(7)
+    axis, angle = draw.normal(size=(32, 1, 3)), draw.uniform(0.15, 1.4, 32)
+    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    wanted = -axis * draw.uniform(0.3, 2.0, (32, 4, 1)) + 0.05 * draw.normal(size=(32, 4, 3))
+    model = FunctionDynamics(lambda x, u: u, n=3, m=3, dt=0.1, integrator="euler")
+    cost = QuadraticCost(Q=[0.0] * 3, R=[1.0] * 3, Qf=[0.0] * 3, u_ref=torch.from_numpy(wanted))
+    cone = Cone(torch.from_numpy(axis[:, 0]), torch.from_numpy(angle), "u")
+    problem = Problem(model, cost, [cone], torch.zeros(32, 3, dtype=D), N=4)
+    found = torchgco.solve(problem, solver=InteriorPoint(max_iterations=5000))
+    assert found.statuses == [Status.CONVERGED] * 32 and float(found.violation.max()) <= 1e-6
+    u, angle = found.U.numpy(), angle[:, None]
+    along = (u * axis).sum(-1)
+    across = np.linalg.norm(u - along[..., None] * axis, axis=-1)
+    assert (across * np.cos(angle) - along * np.sin(angle)).max() < TIP
+    np.testing.assert_allclose(found.cost, 0.5 * np.square(wanted).sum((1, 2)), rtol=1e-4)
 
 
 def test_compiled_numbers_have_names() -> None:

@@ -39,6 +39,7 @@ HELD_NEXT = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
 DRAWN_TIMES, DRAWN_CONTROLS = 0.5, 0.5  # deviations of drawn guesses: in octaves, and of half a control's range
+DRAWN_AGAIN = 4  # times that guesses are drawn where none led to a feasible trajectory
 NEAR = 1e-2  # violation up to which a rough solve says what a trajectory costs
 SAME_TIME = 0.1  # difference of two times, as a share, that makes no other search
 
@@ -290,10 +291,13 @@ class Timed:
             return
         done = best.status == Status.CONVERGED
         rows = (~done & (best.status != Status.INVALID_START)).nonzero().flatten()
-        if rows.numel() > 0:
-            ends = self.chooser.free.run(self._drawn(rows, self.chooser.starts))
+        for again in range(DRAWN_AGAIN):
+            if rows.numel() == 0 or self.call.late:
+                break
+            ends = self.chooser.free.run(self._drawn(rows, self.chooser.starts, again))
             for number in range(self.chooser.starts):
                 self._keep(rows, ends.take(slice(number, None, self.chooser.starts)))
+            rows = self._lost
         rows, rough = done.nonzero().flatten(), self.chooser.rough
         ended = self.best.take(rows)
         rows = rows[~looks_convex(user.take(rows), ended.X[..., : user.n], ended.U[..., : user.m])]
@@ -308,10 +312,10 @@ class Timed:
                 index = chosen * self.chooser.others + start[chosen]
                 self._keep(rows[chosen], self._freed(call.take(index), take(ends.best, index)))
 
-    def _drawn(self, rows: Tensor, count: int) -> Any:
-        """The call of `count` guesses for each of the problems `rows` (b,)."""
+    def _drawn(self, rows: Tensor, count: int, again: int = 0) -> Any:
+        """The call of `count` guesses for each of the problems `rows` (b,), others for each `again`."""
         each = rows.repeat_interleave(count)
-        start = torch.arange(count, device=rows.device).repeat(rows.numel())
+        start = (again * count + torch.arange(count, device=rows.device)).repeat(rows.numel())
         call, user = replace(self.call.take(each), callback=None, warm=None), self.problem.take(each)
         of_time, of_controls = (DrawKey(call.seed, call.ids, STREAM + 2 * start + i) for i in (0, 1))
         U = call.U0[..., : user.m]
