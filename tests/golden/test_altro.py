@@ -62,6 +62,6 @@ def test_eight_starts_and_the_costs_of_ipopt(name: str) -> None:
 @pytest.mark.slow
 def test_the_table(capsys) -> None:
     assert main(["--problems", "pendulum", "--starts", "2"]) == 0
-    lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[3:6]]  # below the file's name and the head
+    lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[3:6]]  # of the file's table
     assert [line[2] for line in lines] == ["default", "default, refined", "IPOPT"]
     assert lines[1][3] == "2 of 2" and float(lines[1][5]) < 1e-6
