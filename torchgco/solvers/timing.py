@@ -432,12 +432,8 @@ def needed_durations(chooser: Chooser, problem: Problem, call: Any, solution: So
     if known:
         places = ", ".join(f"problem {b}: {float(needed[b]):.4g} s" for b in known[:NAMED])
         more = ", ..." if len(known) > NAMED else ""
-        warnings.warn(
-            f"time.most: {len(known)} of {problem.B} problems need more time than that; the least found that would do "
-            f"is, for {places}{more}",
-            HorizonWarning,
-            stacklevel=4,
-        )
+        told = f"{len(known)} of {problem.B} problems need more time than that; the least found that would do is, for"
+        warnings.warn(f"time.most: {told} {places}{more}", HorizonWarning, stacklevel=4)
     return needed
 
 
