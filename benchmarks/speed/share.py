@@ -19,7 +19,7 @@ PHASES = {
     "rest of the proposal": ("torchgco.search.proposals.PathProposals.improve",),
     "plans sampled": ("torchgco.guidance.mppi.MPPI.improve",),
     "tubes solved": ("torchgco.search.tube.Tube._some",),
-    "tightened": ("torchgco.search.chords.Converge.run", "torchgco.search.chords.ClearChords.run"),
+    "tightened": ("torchgco.search.finish.Converge.run", "torchgco.search.finish.ClearChords.run"),
     "verdict": ("torchgco.solvers.session.Session.finished",),
     "packed for C": ("torchgco.native.engine.Engine.packed", "torchgco.native.engine.Engine.terms"),
     "set-up": ("torchgco.native.engine.Engine.__init__",),

@@ -13,7 +13,7 @@ from torchgco import Body, Boxes, InteriorPoint, Problem, Solution, Spheres, jud
 from torchgco.lagrangian.lagrangian import Iterate, SolveEnd
 from torchgco.native.compiler import find_compiler
 from torchgco.search import nearby
-from torchgco.search.chords import continued
+from torchgco.search.finish import continued
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
 

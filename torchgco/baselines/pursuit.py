@@ -19,7 +19,7 @@ from torchgco.obstacles.body import check_no_body
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.clear import evenly, smoothed
 from torchgco.roadmap.geometry import Scene, scene_of
-from torchgco.search.chords import cleared, serving
+from torchgco.search.finish import cleared, serving
 from torchgco.search.tube import radius_of
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Solver

@@ -6,8 +6,8 @@ imports `roadmap`, `guidance` and `solvers`. Begin with `table.py`.
 """
 
 from torchgco.search.candidates import Refine as Refine
-from torchgco.search.chords import ClearChords as ClearChords
-from torchgco.search.chords import Converge as Converge
+from torchgco.search.finish import ClearChords as ClearChords
+from torchgco.search.finish import Converge as Converge
 from torchgco.search.following import Follow as Follow
 from torchgco.search.multistart import MultiStart as MultiStart
 from torchgco.search.proposals import PathProposals as PathProposals

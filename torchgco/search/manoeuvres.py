@@ -19,7 +19,7 @@ from torchgco.roadmap.geometry import Scene, scales, scene_of
 from torchgco.roadmap.lattice import Array, Lattice
 from torchgco.roadmap.mapped import Price, Ways, in_one, ways_of
 from torchgco.search.candidates import Candidates
-from torchgco.search.chords import EXTRA
+from torchgco.search.finish import EXTRA
 from torchgco.search.poses import ARC_LENGTH, TIGHTEST, Poses, clear_at
 from torchgco.search.search import Search
 from torchgco.search.solved_candidates import solved

@@ -18,7 +18,7 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import has_maps, has_paths
 from torchgco.search.arrivals import Arrivals
-from torchgco.search.chords import ClearChords, Converge, Freed
+from torchgco.search.finish import ClearChords, Converge, Freed
 from torchgco.search.nearby import among_nearby
 from torchgco.search.proposals import PathProposals
 from torchgco.search.reach import Horizon, horizon_of

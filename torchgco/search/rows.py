@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 from torchgco.base.options import Count, Natural, Positive
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.search.candidates import Refine
-from torchgco.search.chords import Converge
+from torchgco.search.finish import Converge
 from torchgco.search.following import Follow
 from torchgco.search.proposals import PathProposals
 from torchgco.search.starts import Direct, Join, ReleaseGoal, RequireGoal, Starts

@@ -20,7 +20,7 @@ from torchgco.lagrangian.quality import has_arrived, leaves_goal, outside_goal
 from torchgco.problem.problem import Problem
 from torchgco.receding.holding import held
 from torchgco.search.candidates import Candidates, Refine, Refined
-from torchgco.search.chords import WORTH, ClearChords, Converge, clear_further, solved_nearby
+from torchgco.search.finish import WORTH, ClearChords, Converge, clear_further, solved_nearby
 from torchgco.search.following import Paths
 from torchgco.search.proposals import Part
 from torchgco.search.search import Search, is_sound

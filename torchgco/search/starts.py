@@ -27,7 +27,7 @@ from torchgco.lagrangian.quality import goal_tolerance, has_arrived, outside_goa
 from torchgco.obstacles.base import ADMITTED, Obstacles
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.geometry import has_maps
-from torchgco.search.chords import Converge, clear_further, continued, keep_clear, keep_tight, solved_nearby
+from torchgco.search.finish import Converge, clear_further, continued, keep_clear, keep_tight, solved_nearby
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.reach import beyond_reach
 from torchgco.search.search import Search

@@ -24,7 +24,7 @@ from torchgco.problem.in_time import states_in_time
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.lattice import Array
 from torchgco.roadmap.timed import TimedWays, library_for, timed_ways
-from torchgco.search.chords import EXTRA, solved_nearby
+from torchgco.search.finish import EXTRA, solved_nearby
 from torchgco.search.nearby import WITHOUT_OBSTACLES, without_obstacles
 from torchgco.search.reach import limit_of, push_of
 from torchgco.search.search import Search
