@@ -7,6 +7,7 @@ in, and draws each family of the leaderboard anew from it. `check` draws the lay
 
 from __future__ import annotations
 
+import re
 import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from benchmarks.lib.families import FAMILIES
 from torchgco import InputError, compose
 
 BOARD, SECRETS = ROOT / "benchmarks" / "board", ROOT / "outputs" / "held_back"
+NAME = re.compile(r"[0-9A-Za-z][0-9A-Za-z.+-]*")
 LAYOUTS = 32  # of each family, as many as are public
 MOST_SEED = 10**18  # what a study takes as its seed
 
@@ -30,6 +32,8 @@ MOST_SEED = 10**18  # what a study takes as its seed
 def promise(release: str, board: Path, secrets: Path) -> None:
     """Draw a secret for a release and publish its hash."""
     promises = _promises(board)
+    if not NAME.fullmatch(release):  # it ends the name of the secret's file, which must not lie elsewhere
+        raise InputError("release", "a version, as 0.2.0", release)
     if release in promises.index:
         raise InputError("release", "one that has no promise yet", release)
     secret = token_hex(32)

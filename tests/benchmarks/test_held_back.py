@@ -70,3 +70,10 @@ def test_a_lost_secret_is_told(asked, tmp_path: Path, capsys) -> None:
     asked("promise")
     (tmp_path / "secrets" / f"{RELEASE}.txt").unlink()
     assert asked("reveal") == 2 and "no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("release", ["../0.2.0", "", "0.2.0/a", ".", "a b"])
+def test_a_name_that_leads_elsewhere_is_refused(release: str, tmp_path: Path, capsys) -> None:
+    words = ["promise", release, "--board", str(tmp_path), "--secrets", str(tmp_path / "secrets")]
+    assert held_back.main(words) == 2 and "release" in capsys.readouterr().err
+    assert list(tmp_path.rglob("*.txt")) == []

@@ -10,7 +10,7 @@ from torch import Tensor
 
 import torchgco
 from tests.engines import compiled
-from torchgco import ControlBounds, FunctionCost, FunctionDynamics, InteriorPoint, Problem, Status
+from torchgco import ControlBounds, FreeTime, FunctionCost, FunctionDynamics, Goal, InteriorPoint, Problem, Status
 from torchgco.kernels import use_native
 from torchgco.solvers.contracts import Call
 
@@ -67,3 +67,25 @@ def test_where_no_time_is_left_to_leave_one_the_solve_is_late(monkeypatch) -> No
     call = Call.checked(problem, torch.zeros(1, N, problem.m, dtype=D))
     end = InteriorPoint().solved(call, escapes=True)
     assert Status(int(end.status)) is Status.TIME_LIMIT and not bool(end.best.U.any())
+
+
+@compiled
+def test_goals_behind_what_only_drives_forwards_are_reached_in_a_free_time() -> None:
+    """The straight guess is a saddle at any time: none of 24 distances may end there, or later than by a turn."""
+    away = torch.linspace(0.2, 1.5, 24, dtype=D)
+
+    def rates(x: Tensor, u: Tensor) -> Tensor:
+        return torch.stack((u[..., 0] * x[..., 2].cos(), u[..., 0] * x[..., 2].sin(), u[..., 1]), -1)
+
+    problem = Problem(
+        FunctionDynamics(rates, 3, 2, 0.1, "rk4", position=slice(0, 2)),
+        FunctionCost(lambda x, u: 1e-3 * u.square().sum(-1)),
+        [ControlBounds([0.0, -1.5], [1.0, 1.5])],
+        torch.zeros(24, 3, dtype=D),
+        N=20,
+        goal=Goal(torch.stack((-away, 0.0 * away), dim=-1), 0.01, required=True),
+        time=FreeTime(0.2, 6.0, weight=1.0),
+    )
+    found = torchgco.solve(problem)
+    assert [b for b, status in enumerate(found.statuses) if status != Status.CONVERGED] == []
+    assert bool((found.duration <= torch.pi / 1.5 + away).all())

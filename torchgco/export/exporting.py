@@ -60,7 +60,7 @@ def export_c(
         build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
             "zephyr", a module with a sample. Of the last two NAME.h and NAME.c lie in `src`.
         dtype: of all numbers in C. torch.float32 is for processors without a unit for doubles: half of the memory, and
-            controls to about 1e-4 of their range, as it ends earlier.
+            controls to 1e-3 of their range or, mostly, 1e-4.
 
     Returns:
         the folder.

@@ -237,8 +237,7 @@ class Timed:
 
     def _is_short(self, rows: Tensor, solution: Solution) -> Tensor:
         """Whether trajectories are as short as they may be."""
-        factors = factors_in(self.problem.take(rows), solution.X)
-        return (factors <= AT_LEAST * self.time.least[rows]).all(-1)
+        return (factors_in(self.problem.take(rows), solution.X) <= AT_LEAST * self.time.least[rows]).all(-1)
 
     def _freed(self, call: Any, start: Solution | Iterate) -> Solution:
         """The trajectories with the time free."""
@@ -258,8 +257,7 @@ class Timed:
     @property
     def _lost(self) -> Tensor:
         """The problems (b,) that could be solved, and have no feasible trajectory."""
-        status = self.best.status
-        lost = ~(self.best.violation <= self.chooser.limit) & (status != Status.INVALID_START)
+        lost = ~(self.best.violation <= self.chooser.limit) & (self.best.status != Status.INVALID_START)
         return lost.nonzero().flatten()
 
     def _again(self) -> None:
@@ -282,25 +280,23 @@ class Timed:
         """Take the time as a variable from trajectories of drawn controls in drawn times about the one found.
 
         Least times are local: of controls that turn a thrust there are many. Where nothing has converged yet, each
-        guess is solved; where nothing is feasible, the time found says nothing, and all that are allowed are drawn.
+        guess is solved; where nothing is feasible, the time found says nothing, and all that are allowed are drawn,
+        several times over: a guess beside a saddle, as of a goal behind what only drives forwards, leads there mostly.
         Elsewhere, but for problems that look convex, all are solved roughly, side by side; the best of each problem is
         solved on where it may be better than what is known.
         """
-        user, best = self.problem, self.best
+        user, done = self.problem, self.best.status == Status.CONVERGED
         if self.chooser.starts == 0 or self.call.late:
             return
-        done = best.status == Status.CONVERGED
-        rows = (~done & (best.status != Status.INVALID_START)).nonzero().flatten()
-        for again in range(DRAWN_AGAIN):
-            if rows.numel() == 0 or self.call.late:
-                break
+        rows = (~done & (self.best.status != Status.INVALID_START)).nonzero().flatten()
+        again = 0
+        while rows.numel() > 0 and again < DRAWN_AGAIN and not self.call.late:
             ends = self.chooser.free.run(self._drawn(rows, self.chooser.starts, again))
             for number in range(self.chooser.starts):
                 self._keep(rows, ends.take(slice(number, None, self.chooser.starts)))
-            rows = self._lost
+            rows, again = self._lost, again + 1
         rows, rough = done.nonzero().flatten(), self.chooser.rough
-        ended = self.best.take(rows)
-        rows = rows[~looks_convex(user.take(rows), ended.X[..., : user.n], ended.U[..., : user.m])]
+        rows = rows[~looks_convex(user.take(rows), self.best.X[rows, :, : user.n], self.best.U[rows, :, : user.m])]
         if rows.numel() > 0 and rough is not None and not self.call.late:
             call, old = self._drawn(rows, self.chooser.others), self.best.take(rows)
             ends = rough(call)
@@ -315,7 +311,7 @@ class Timed:
     def _drawn(self, rows: Tensor, count: int, again: int = 0) -> Any:
         """The call of `count` guesses for each of the problems `rows` (b,), others for each `again`."""
         each = rows.repeat_interleave(count)
-        start = (again * count + torch.arange(count, device=rows.device)).repeat(rows.numel())
+        start = torch.arange(again * count, (again + 1) * count, device=rows.device).repeat(rows.numel())
         call, user = replace(self.call.take(each), callback=None, warm=None), self.problem.take(each)
         of_time, of_controls = (DrawKey(call.seed, call.ids, STREAM + 2 * start + i) for i in (0, 1))
         U = call.U0[..., : user.m]
@@ -418,9 +414,9 @@ def needed_durations(chooser: Chooser, problem: Problem, call: Any, solution: So
     rows = (~(solution.violation <= chooser.limit) & (solution.status != Status.INVALID_START)).nonzero().flatten()
     if rows.numel() == 0 or call.late:
         return None
-    subset, time = problem.take(rows), problem.time
+    subset = problem.take(rows)
+    time = subset.time
     assert time is not None
-    time = time.take(rows)
     freed = replace(time, least=time.most, most=BEYOND * time.most, guess=None, weight=torch.ones_like(time.weight))
     longer = subset._with({"time": freed, "cost": _Nothing(subset.cost)})
     call = replace(call.take(rows), problem=in_time(longer), X0=None, warm=None)
