@@ -71,7 +71,7 @@ def test_a_study_writes_all_its_files(run, tmp_path) -> None:
 @pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("without_report")
 def test_the_bar_counts_the_solved_problems(workers: int, run, monkeypatch) -> None:
-    monkeypatch.setattr(workers, "tqdm", partial(tqdm, mininterval=0))
+    monkeypatch.setattr("torchgco.experiments.flying.workers.tqdm", partial(tqdm, mininterval=0))
     monkeypatch.setattr(progress, "watched", lambda: True)
     words = ["solver=al_ilqr", "study.baselines=[]", *TINY[:4], f"study.workers={workers}", "hydra.run.dir=out"]
     code, _, err = run(*words)
