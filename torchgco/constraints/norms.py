@@ -205,8 +205,8 @@ class Cone(Vectors):
         knots: default 1..N for states, 0..N-1 for controls.
         apex: where v = z - apex begins, (d,), (B, d) or per knot (B|1, K, d); None: 0. Not for attitudes.
 
-    Violations are distances from the cone in the units of v, 0 where the row holds, which such short vectors outside
-    may meet (by less than 1e-4); of attitudes angles beyond `angle`, rad.
+    Violations are distances from the cone in the units of v; of vectors up to 1e-4 those of the row, which such vectors
+    meet outside, too; of attitudes angles beyond `angle`, rad.
 
     Raises:
         InputError: on `Problem(...)`: components that the model doesn't have or that are given twice, other than four
@@ -284,9 +284,11 @@ class Cone(Vectors):
         outside = across * cosine - along * sine
         # Behind the tip the nearest point of the cone is the tip.
         behind = (outside > 0) & (along * cosine + across * sine < 0)
-        outside = torch.where(behind, v.norm(dim=-1), outside).unsqueeze(-1)
-        # What meets the row is a solution: solvers, which see rows alone, can't come any nearer.
-        return torch.minimum(outside, self.value(X, U)).clamp(min=0.0)
+        length = v.norm(dim=-1).unsqueeze(-1)
+        outside = torch.where(behind.unsqueeze(-1), length, outside.unsqueeze(-1))
+        # At the tip what meets the row is a solution: solvers, which see rows alone, can't come any nearer.
+        row = torch.minimum(outside, self.value(X, U))
+        return torch.where(length <= TIP, row, outside).clamp(min=0.0)
 
     def moved_inside(self, U: Tensor, turned: Tensor) -> Tensor:
         """The vectors (B, K, c) of controls U; those outside, and `turned` (B, K, 1) bool, along the axis."""
