@@ -59,10 +59,10 @@ def reveal(release: str, board: Path, secrets: Path) -> None:
 
 def check(release: str, board: Path) -> None:
     """Compare the published secret with its hash, and the published layouts with those that it leads to."""
-    secret = str(_promised(release, board).loc[release, "secret"])
+    digest, secret = _promised(release, board).loc[release, ["sha256", "secret"]]
     if not secret:
         raise InputError("release", "one whose secret is published", f"{release}, which isn't revealed yet")
-    if _digest(secret) != _promises(board).loc[release, "sha256"]:
+    if _digest(secret) != digest:
         raise InputError("release", "the secret whose hash was published", "another one")
     with TemporaryDirectory() as folder:
         for path in draw(release, secret, Path(folder)):

@@ -39,7 +39,7 @@ HELD_NEXT = 2.0  # the next one, of the one before
 AT_LEAST = 1.05  # a factor within this of `least` may have fallen there from too short a guess
 BEYOND = 16.0  # how much longer than `most` a time is looked for that would do
 DRAWN_TIMES, DRAWN_CONTROLS = 0.5, 0.5  # deviations of drawn guesses: in octaves, and of half a control's range
-DRAWN_AGAIN = 4  # times that guesses are drawn where none led to a feasible trajectory
+DRAWN_AGAIN = 4  # draws where nothing is feasible: of 36 goals close behind a car one draw reaches 27, four 35
 NEAR = 1e-2  # violation up to which a rough solve says what a trajectory costs
 SAME_TIME = 0.1  # difference of two times, as a share, that makes no other search
 
