@@ -12,6 +12,7 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -79,13 +80,16 @@ def by_hand(problem: Problem, found: Solution) -> float | None:
     weights = [float(problem.cost.stage(at, (rest + one[i]).expand(1, 4), 0)) for i in range(4)]
     cost = 0.0
     for k in range(N):
-        h = tau[of_stages[k]]
-        ahead = X[:, k] + h * dt * field(X[:, k], U[:, k], gravity, lag)
+        h, rates = tau[of_stages[k]] * dt, partial(field, u=U[:, k], gravity=gravity, lag=lag)
+        k1 = rates(X[:, k])
+        k2 = rates(X[:, k] + 0.5 * h * k1)
+        k3 = rates(X[:, k] + 0.5 * h * k2)
+        ahead = X[:, k] + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(X[:, k] + h * k3))
         ahead[6:10] = ahead[6:10] / ca.norm_2(ahead[6:10])
         rows.append(X[:, k + 1] - ahead)
         low, high = low + [0.0] * 14, high + [0.0] * 14
         beside = sum(w * (U[i, k] - rest[i].item()) ** 2 for i, w in enumerate(weights))
-        cost += h * (float(time_.weight[0]) * dt + beside)
+        cost += tau[of_stages[k]] * (float(time_.weight[0]) * dt + beside)
     goal = problem.goal
     assert goal is not None
     balls = [*zip(gates.places[0].tolist(), gates.centers[0].numpy(), gates.sizes[0].tolist(), strict=True),

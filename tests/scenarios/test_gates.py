@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from torchgco import FreeTime, InputError, compose
+import torchgco
+from torchgco import FreeTime, InputError, Status, compose
+from torchgco.base.errors import StepWarning
 from torchgco.constraints.gates import GateBalls
+from torchgco.dynamics.base import INTEGRATORS
+from torchgco.experiments.config.build import Setup
 from torchgco.scenarios import GateForest, Layouts, Race, concatenate
 
 
@@ -97,3 +101,31 @@ def test_the_time_is_given_where_spheres_move() -> None:
 def test_missions_refuse_them() -> None:
     with pytest.raises(InputError, match="scenario: expected one in space for a mission"):
         compose(["experiment=mission", "scenario=gates"])
+
+
+def _misses(setup: Setup) -> tuple[float, float]:
+    """How far from the plan's places at the gates its controls lead under the field itself: the least and the most."""
+    layouts = setup.layouts(2)
+    problem = setup.task(layouts).problem
+    plan = torchgco.solve(problem)
+    assert bool((plan.status == Status.CONVERGED).all())
+    lengths, x, misses = plan.t.diff(dim=1), plan.X[:, 0], []
+    for k in range(problem.N):
+        rates = lambda z, k=k: lengths[:, k, None] * problem.dynamics.field(z, plan.U[:, k])
+        for _ in range(20):
+            x = INTEGRATORS["rk4"](rates, x, 1 / 20)
+        if k + 1 in problem.time.segments:
+            misses.append((x - plan.X[:, k + 1])[:, :3].norm(dim=-1))
+    return float(torch.stack(misses).min()), float(torch.stack(misses).max())
+
+
+@pytest.mark.filterwarnings("error::torchgco.base.errors.StepWarning")
+def test_plans_lead_through_the_gates_under_the_model_itself() -> None:
+    assert _misses(compose(["scenario=gates", "scenario.num_gates=[3,3]"]))[1] < 0.01
+
+
+@pytest.mark.slow
+def test_steps_of_euler_that_lead_past_the_gates_are_told() -> None:
+    words = ["scenario=gates", "scenario.num_gates=[3,3]", "scenario.integrator=euler"]
+    with pytest.warns(StepWarning, match=r"Euler's steps change the costs of . of 2 trajectories by over 1 %"):
+        assert _misses(compose(words))[1] > 0.5  # m: the radius of the gates
