@@ -14,6 +14,7 @@ from torch import Tensor
 import torchgco
 from tests.slow import mostly
 from torchgco import (
+    BetweenKnots,
     ControlBounds,
     Cost,
     Dynamics,
@@ -22,10 +23,13 @@ from torchgco import (
     FunctionCost,
     FunctionDynamics,
     InputError,
+    Integral,
     Problem,
     RateBounds,
     Solution,
+    StateBounds,
 )
+from torchgco.dynamics.base import INTEGRATORS
 
 N, DT = 3, 0.25
 Function = Callable[..., Tensor]
@@ -263,3 +267,52 @@ def test_a_branch_that_mixes_knots_is_raised(part: str, form: str) -> None:
 def test_what_is_returned_is_what_each_row_gives_of_many_functions() -> None:
     kinds = [numbers_are_own(seed) for seed in range(8, 208)]
     assert {"apart solved", "mixed refused", "branch solved", "branch refused"} == set(kinds)
+
+
+class Slowing(Dynamics):
+    n, m, dt, integrator = 2, 1, DT, "rk4"
+
+    def field(self, x: Tensor, u: Tensor) -> Tensor:
+        return field(x, u) * (0.5 if bool((x[..., 1] > 0.6).any()) else 1.0)
+
+
+CARRIED: dict[str, Callable[[], Any]] = {
+    "rows within stages": lambda: BetweenKnots(FunctionConstraint(BRANCHED["rows"])),
+    "a model within stages": lambda: BetweenKnots(StateBounds([-9.0, -9.0], [9.0, 0.7])),
+    "an integral": lambda: Integral(
+        lambda x, u: u[..., 0].square() * (3.0 if bool((x[..., 1] > 0.6).any()) else 1.0), most=2.0
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CARRIED)
+def test_rows_within_stages_and_integrals_are_evaluated_row_by_row(kind: str) -> None:
+    """The judge's violation is that of each instant alone."""
+    model = Slowing() if "model" in kind else FunctionDynamics(field, 2, 1, DT, "rk4")
+    p = Problem(model, FunctionCost(stage, end), [CARRIED[kind]()], [[0.6, 0.3]], N)
+    U = 3.0 * torch.rand(1, N, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x, worst, total = p.x0, 0.0, 0.0
+    for u in U[0].split(1):
+        ahead = lambda share, x=x, u=u: INTEGRATORS["rk4"](lambda z: model.field(z, u), x, share * DT)
+        total += float(_integrated(x, u))
+        for share in (0.25, 0.5, 0.75):
+            row = ahead(share)[:, 1] - 0.7 if "model" in kind else BRANCHED["rows"](ahead(share))
+            worst = max(worst, float(row))
+        x = ahead(1.0)
+    alone = max(0.0, total - 2.0) if kind == "an integral" else worst
+    assert alone > 0.05 and float(torchgco.judge(p, U).violation) == pytest.approx(alone, rel=1e-9)
+
+
+def _integrated(x: Tensor, u: Tensor) -> Tensor:
+    """The third kind's integral over a stage, by RK4 of state and integral together."""
+    rate = lambda z: u[..., 0].square() * (3.0 if float(z[..., 1]) > 0.6 else 1.0)
+    rates = lambda z: torch.cat((field(z[..., :2], u), rate(z).unsqueeze(-1)), -1)
+    return INTEGRATORS["rk4"](rates, torch.cat((x, torch.zeros(1, 1)), -1).double(), DT)[..., 2]
+
+
+def test_a_branch_within_stages_is_raised() -> None:
+    kind = FunctionConstraint(lambda x: x[..., 1:] - (3.0 if float(x[..., 0].max()) > 0.5 else 1.0), name="speed")
+    model = FunctionDynamics(field, 2, 1, DT, "rk4")
+    p = Problem(model, FunctionCost(stage, lambda x: 60.0 * end(x)), [BetweenKnots(kind)], [[0.0, 0.0]], N)
+    with pytest.raises(InputError, match=r"speed\.function: expected rows of one knot .* by itself"):
+        solved(p, "interior_point")

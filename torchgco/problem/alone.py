@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError
-from torchgco.base.tree import Rows
+from torchgco.base.tree import Rows, is_users
 from torchgco.base.values import whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
+from torchgco.constraints.between_knots import BetweenKnots
+from torchgco.constraints.link import Integral, _Summed
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.border import ONE_KNOT, OWN_ROW, STEP_OF_STAGE, called
@@ -24,6 +26,8 @@ from torchgco.problem.in_time import at_times
 from torchgco.problem.joined import unlike
 from torchgco.problem.problem import Problem
 from torchgco.problem.refusals import Refusals, sparing_part, with_looking
+
+OF_STAGE = "a number for each state and control, of these alone"
 
 # Values (b, ...) of a problem along X, U, of all knots at once or, where they can be had so, one knot after the other.
 Values: TypeAlias = Callable[[Problem, Tensor, Tensor, bool], Tensor]
@@ -45,7 +49,7 @@ def row_by_row(problem: Problem, again: bool = False) -> Problem:
             return _made(spared, _Field if type(part).step is Dynamics.step else _Step)
         if isinstance(part, Cost):
             return _made(spared, _Cost if type(part).total is Cost.total else _Total)
-        return _made(spared, _Function if isinstance(part, FunctionConstraint) else _Constraint)
+        return _rows_alone(spared)
 
     return with_looking(problem, change, again)
 
@@ -98,9 +102,11 @@ def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values
             yield "cost.terminal", OWN_ROW, lambda p, X, U, _: p.cost.terminal(X[:, -1])
     for i, (bound, other) in enumerate(zip(problem.constraints, apart.constraints, strict=True)):
         if bound is not other:
-            is_function = isinstance(bound, FunctionConstraint)
-            field = f"{bound.name}.function" if isinstance(bound, FunctionConstraint) else f"constraints[{i}].value"
-            yield field, ONE_KNOT if is_function else OWN_ROW, lambda p, X, U, _, i=i: p.constraints[i].value(X, U)
+            rows = bound.constraint if isinstance(bound, BetweenKnots) else bound
+            field, wanted = f"constraints[{i}].value", OWN_ROW
+            if isinstance(rows, FunctionConstraint | Integral):
+                field, wanted = f"{rows.name}.function", OF_STAGE if isinstance(rows, Integral) else ONE_KNOT
+            yield field, wanted, lambda p, X, U, _, i=i: p.constraints[i].value(X, U)
 
 
 def _steps(problem: Problem, X: Tensor, U: Tensor, at_once: bool) -> Tensor:
@@ -147,6 +153,18 @@ def _at(z: Tensor, b: int, i: int | None) -> Tensor:
 
 def _one(b: int) -> slice:
     return slice(b, b + 1)
+
+
+def _rows_alone(part: Any) -> Any:
+    """A constraint whose code sees each row by itself, and so does what it evaluates between the knots."""
+    if isinstance(part, FunctionConstraint):
+        return _made(part, _Function)
+    made = _made(part, _Integral if isinstance(part, Integral) else _Constraint)
+    if is_users(model := getattr(made, "model", None)):
+        object.__setattr__(made, "model", _made(model, _Field if type(model).step is Dynamics.step else _Step))
+    if isinstance(part, BetweenKnots) and is_users(part.constraint):
+        object.__setattr__(made, "constraint", _rows_alone(part.constraint))
+    return made
 
 
 class _Field(Dynamics):
@@ -224,3 +242,17 @@ class _Constraint(Constraint):
 
     def _of_each(self, name: str, X: Tensor, U: Tensor) -> Tensor:
         return torch.cat([getattr(self.take(_one(b)), name)(X[_one(b)], U[_one(b)]) for b in range(len(X))])
+
+
+class _Integral(_Constraint, Integral):
+    @property
+    def _summed(self) -> _Summed:
+        return _made(super()._summed, _Sums)
+
+
+class _Sums(_Summed):
+    def _rate(self, x: Tensor, u: Tensor, k: int | Tensor | None) -> Tensor:
+        if x.shape[:-1] == (1,):
+            return super()._rate(x, u, k)
+        number = lambda i: int(k[i]) if isinstance(k, Tensor) and k.dim() == 1 else k
+        return _each(lambda b, i: self.take(_one(b))._rate(_at(x, b, i), _at(u, b, i), number(i)), x, u)
