@@ -247,6 +247,22 @@ def test_a_status_counts_what_lies_at_its_limit() -> None:
     assert [Status(int(s)) for s in status] == want
 
 
+@pytest.mark.parametrize("solver", ["interior_point", "al_ilqr"])
+def test_a_solver_with_a_smaller_tolerance_calls_feasible_what_the_judge_does(solver: str) -> None:
+    """Two rows, between which a gap is left that no state closes: 0.5 mm is feasible, 2 mm isn't."""
+    gap = torch.tensor([[5e-4], [2e-3]], dtype=torch.float64)
+    rows = [
+        FunctionConstraint(lambda x, gap, side=side: side * (x[..., :1] - 0.5) + gap, knots=[8], values={"gap": gap})
+        for side in (1.0, -1.0)
+    ]
+    model = FunctionDynamics(lambda x, u: torch.stack((x[..., 1], u[..., 0]), -1), 2, 1, dt=0.2, integrator="rk4")
+    cost = QuadraticCost(Q=[1, 0.1], R=[0.1], Qf=[1, 1], x_ref=[0.5, 0.0])
+    problem = Problem(model, cost, [ControlBounds(-3.0, 3.0), *rows], torch.zeros(2, 2, dtype=torch.float64), 8)
+    found = solve(problem, solver=solver)
+    feasible = [status in (Status.CONVERGED, Status.FEASIBLE) for status in found.statuses]
+    assert feasible == judge(problem, found.U).feasible.tolist() == [True, False]
+
+
 def test_what_is_not_finite_does_not_start() -> None:
     problem, _ = planar_batch(B=6, N=2, obstacles=1)
     X, merit = torch.zeros(6, 3, problem.n, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)

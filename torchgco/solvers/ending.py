@@ -162,16 +162,16 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
 def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:
     """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
 
-    CONVERGED: stationary and feasible. FEASIBLE: feasible but not stationary, for problems with constraints.
-    INFEASIBLE: not feasible, although higher penalties were tried for as long as they gained anything, or for rows that
+    CONVERGED: stationary, and violated by no more than the solver's own tolerance. FEASIBLE: by no more than `ADMITTED`,
+    for problems with constraints. INFEASIBLE: by more, although higher penalties were tried for as long as they gained anything, or for rows that
     no control moves. Where neither holds, and where a solve failed, the reason stays.
     """
-    over, fits = is_over(ended), violation <= tolerance
+    over, fits = is_over(ended), violation <= max(tolerance, ADMITTED)
     stationary = (left <= STATIONARY) | (over & ((left <= DOUBTED) | torch.isinf(left)))
     limit = torch.full_like(ended, int(Status.MAX_ITERATIONS))
     reason = torch.where((ended == Status.CONVERGED) | (ended == STALLED) | over, limit, ended)
     status = torch.where(fits & constrained, int(Status.FEASIBLE), reason)
-    status = torch.where(stationary & fits, int(Status.CONVERGED), status)
+    status = torch.where(stationary & (violation <= tolerance), int(Status.CONVERGED), status)
     status = torch.where(~fits & ((ended == STALLED) | (ended == UNMOVED)), int(Status.INFEASIBLE), status)
     status = torch.where(torch.isinf(left) & ~over, int(Status.NOT_POSITIVE_DEFINITE), status)
     status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more

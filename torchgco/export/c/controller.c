@@ -355,7 +355,7 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
         fits = guess_fits;
     } else if (!sound) return NON_FINITE;
     if (status == CONVERGED) status = MAX_ITERATIONS; /* but for its violation */
-    return fits && CONSTRAINED ? FEASIBLE : status;
+    return (fits || w->violation <= ADMITTED) && CONSTRAINED ? FEASIBLE : status;
 }
 
 /* Again from what the plan before leads to now, as far as it keeps the constraints. */
