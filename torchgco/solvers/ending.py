@@ -162,9 +162,10 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
 def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: float, constrained: bool) -> Tensor:
     """The status (B,) of the returned trajectories, for statuses `ended` that say why the solve stopped.
 
-    CONVERGED: stationary, and violated by no more than the solver's own tolerance. FEASIBLE: by no more than `ADMITTED`,
-    for problems with constraints. INFEASIBLE: by more, although higher penalties were tried for as long as they gained anything, or for rows that
-    no control moves. Where neither holds, and where a solve failed, the reason stays.
+    CONVERGED: stationary, and violated by no more than the solver's own tolerance. FEASIBLE: by no more than
+    `ADMITTED`, for problems with constraints. INFEASIBLE: by more, although higher penalties were tried for as long as
+    they gained anything, or for rows that no control moves. Where neither holds, and where a solve failed, the reason
+    stays.
     """
     over, fits = is_over(ended), violation <= max(tolerance, ADMITTED)
     stationary = (left <= STATIONARY) | (over & ((left <= DOUBTED) | torch.isinf(left)))

@@ -128,8 +128,8 @@ class InteriorPoint(Solver, named="solver"):
     Args:
         tolerance: of the optimality conditions, scaled as in the paper; in float32 8e-6, or what rounding allows.
             IPOPT: tol.
-        violation_tolerance: residual (metres for lengths) up to which a trajectory may have converged; in float32 1.2e-5
-            at least. IPOPT: constr_viol_tol.
+        violation_tolerance: residual (metres for lengths) up to which a trajectory may have converged; in float32
+            1.2e-5 at least. IPOPT: constr_viol_tol.
         max_iterations: of each problem. IPOPT: max_iter.
         initial_barrier: the barrier parameter mu at the start. IPOPT: mu_init.
         warm_barrier: the same, and `bound_push`, for a call with multipliers of an earlier solution.
