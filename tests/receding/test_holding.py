@@ -284,3 +284,20 @@ def test_a_robot_speeds_up_in_a_bend_where_only_that_serves() -> None:
     assert float((problem.dynamics.step(problem.x0, mixed[:, 0, -1])).abs().max()) < 1.0
     one = Problem(PULLED, QuadraticCost([1.0] * 4, [0.1] * 2, [1.0] * 4), [], [[0.0, 0, 1, 0]], N)
     assert stopping(one, None, mixed=True) is None, "no bounds, no shares of them"
+
+
+def test_feasible_speaks_of_what_lies_between_the_knots() -> None:
+    """Of a vehicle that drives along thin poles with long stages, in every period what a dense look at the plan says."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.4, "rk4", slice(0, 2))
+    cost = QuadraticCost(Q=[0.3, 1.0, 0.05, 0.05], R=[0.05, 0.05], Qf=[5.0, 5.0, 0.5, 0.5], x_ref=[8.0, 0.0, 0.0, 0.0])
+    poles = Spheres([[1.5, 0.05], [3.0, -0.1], [4.6, 0.1], [6.1, -0.05]], 0.05, 0.1)
+    start = torch.tensor([[0.0, 0.0, 2.0, 0.0]], dtype=torch.float64)
+    problem = Problem(model, cost, [ControlBounds([-2.0] * 2, [2.0] * 2), poles], start, 12)
+    loop, x, said, seen = MPC(problem), start, [], []
+    for _ in range(12):
+        u = loop.step(x)
+        now = problem.started_at(x, problem.constraints)
+        said.append(bool(loop.feasible))
+        seen.append(float(torchgco.judge(now, loop.plan.moved_to(loop.t).U).clearance) >= 0)
+        x = model.step(x, u)
+    assert said == seen and set(said) == {True, False}

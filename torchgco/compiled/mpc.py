@@ -22,9 +22,10 @@ from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbers import Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, stage_of
 from torchgco.guidance.mppi import MPPI
-from torchgco.kernels import current, held_on_cpu, open_loop, served_by
+from torchgco.kernels import current, held_on_cpu, open_loop, path_clearance, served_by
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.alone import check_rows
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, clamped, held
 from torchgco.receding.plan import Plan, stages_between
@@ -113,7 +114,7 @@ class MPC:
         """Forget the plan, and begin at time 0 again: the next step solves as the first one does."""
         self.t, self.answer, self._plan = 0.0, None, None
         self._held = np.zeros(self._problem.B, dtype=bool)
-        self._feasible = np.zeros(self._problem.B, dtype=bool)
+        self._feasible, self._unlooked = np.zeros((2, self._problem.B), dtype=bool)
         self._begun = np.zeros(self._problem.B)
         self._u: Tensor | None = None
         self.numbers.write(self._at_first)
@@ -141,11 +142,19 @@ class MPC:
 
     @property
     def feasible(self) -> Tensor:
-        """Which vehicles are known to keep their constraints by what they fly, (B,) bool.
+        """Which vehicles are known to keep their constraints by what they fly, (B,) bool, between the knots, too.
 
         A plan that is held needn't reach a required goal. False before the first step, and of plans that are held where
-        the time is free: they aren't looked at.
+        the time is free: they aren't looked at. New plans are looked at between the knots when this is asked for.
         """
+        rows = torch.from_numpy(self._feasible & self._unlooked).nonzero().flatten()
+        if rows.numel() > 0 and self.answer is not None:
+            times = None if self.answer.t is None else self.answer.t[rows]
+            with torch.no_grad(), torch.inference_mode(False), computing_on(CPU):
+                now = at_times(self.compiled.now.take(rows), self.answer.X[rows], self.answer.U[rows], times)
+                if all(obstacles.has_chords for obstacles in now[0].obstacles):
+                    self._feasible[rows.numpy()] = (path_clearance(*now) >= 0).numpy()
+        self._unlooked[:] = False
         return torch.from_numpy(self._feasible.copy())
 
     @property
@@ -207,7 +216,7 @@ class MPC:
         self._motion.keep(self.compiled.problem, now)
         ended = answer.status.numpy()
         solved = (ended == CONVERGED) | (ended == FEASIBLE)
-        self._held, self._feasible = ~solved, solved.copy()
+        self._held, self._feasible, self._unlooked = ~solved, solved.copy(), solved.copy()
         if solved.all():
             self._begun, self._plan = np.full(len(solved), now), None
             u = self._made(answer).mean(now, self.period) if self._free else answer.u
