@@ -90,6 +90,14 @@ VALUES: dict[str, Function] = {  # steps, and those whose derivatives PyTorch ha
     "softshrink": lambda x: F.softshrink(x, 0.3) + F.softshrink(x.sqrt()),
     "one of four": lambda x: F.one_hot(torch.tensor([2]), 4).to(x) * x.sign(),
 }
+AT_ZERO: dict[str, tuple[Function, bool]] = {  # where PyTorch's slope is 0, and whether it has a curvature there
+    "std": (lambda x: x.std(-1, keepdim=True), True),
+    "std_mean": (lambda x: torch.cat(torch.std_mean(x, -1, correction=0, keepdim=True), -1), True),
+    **{
+        f"norm of order {p}": (lambda x, p=p: torch.linalg.vector_norm(x, p, -1, keepdim=True), p == 3)
+        for p in (-1, 0.5, 1.5, 2.5, 3)
+    },
+}
 POINTS = 1.5 * torch.randn(6, 4, dtype=D, generator=torch.Generator().manual_seed(1))
 
 
@@ -101,18 +109,19 @@ def traced(function: Function) -> tuple[ca.SX, ca.SX]:
     return x, ca.vertcat(*(ca.SX(element) for element in made(np.zeros(0), elements).reshape(-1)))
 
 
-def compared(function: Function, curved: bool) -> None:
+def compared(function: Function, curved: bool, points: Tensor = POINTS, sloped: bool = False) -> None:
     x, y = traced(function)
     weights = torch.cos(torch.arange(y.numel(), dtype=D))
     slopes, (H, _) = ca.jacobian(y, x), ca.hessian(ca.dot(ca.DM(weights.numpy()), y), x)
     mine = ca.Function("made", [x], [y, slopes, H])
     whole = lambda z: function(z[None])[0]
-    for point in POINTS:
+    for point in points:
         value, J, H = (torch.from_numpy(np.array(part)) for part in mine(point.numpy()))
         near = {"rtol": 1e-9, "atol": 1e-9, "equal_nan": True}
         torch.testing.assert_close(value.flatten(), whole(point), **near)
-        if curved:
+        if curved or sloped:
             torch.testing.assert_close(J, torch.autograd.functional.jacobian(whole, point), **near)
+        if curved:
             total = lambda z: (weights * whole(z)).sum()
             torch.testing.assert_close(H, torch.autograd.functional.hessian(total, point), rtol=1e-8, atol=1e-8)
 
@@ -126,6 +135,13 @@ def test_values_and_derivatives_are_those_of_pytorch(name: str) -> None:
 @pytest.mark.parametrize("name", VALUES)
 def test_values_are_those_of_pytorch(name: str) -> None:
     compared(VALUES[name], False)
+
+
+@pytest.mark.parametrize("name", AT_ZERO)
+def test_slopes_at_zeros_and_of_equal_numbers_are_those_of_pytorch(name: str) -> None:
+    function, curved = AT_ZERO[name]
+    equal = torch.tensor([[0.0] * 4, [0.0, 1.0, 2.0, 0.0]] + [[0.5] * 4] * ("std" in name), dtype=D)
+    compared(function, curved, equal, True)
 
 
 def test_sorted_numbers_are_in_order_for_all_lengths() -> None:

@@ -63,6 +63,11 @@ def _var_mean(x: Tensor, dim: Any = None, correction: Any = None, keepdim: bool 
     return var, mean if keepdim else x.mean(dims)
 
 
+def _std_mean(*args: Any, **more: Any) -> tuple[Tensor, Tensor]:
+    var, mean = _var_mean(*args, **more)
+    return torch.where(var == 0, 0.0, var.sqrt()), mean  # at 0 the derivative is 0, as PyTorch's
+
+
 def _layer_norm(x: Tensor, shape: Sequence[int], weight: Any, bias: Any, eps: float) -> tuple[Tensor, ...]:
     var, mean = _var_mean(x, list(range(-len(shape), 0)), 0, True)
     scale = (var + eps).rsqrt()
@@ -98,7 +103,8 @@ def _norm(x: Tensor, ord: float = 2, dim: Any = None, keepdim: bool = False, dty
         return size.amax(dims, keepdim) if ord > 0 else size.amin(dims, keepdim)
     if ord in (0, 1):
         return (size if ord else (size != 0).to(x.dtype)).sum(dims, keepdim=keepdim)
-    total = (size**ord).sum(dims, keepdim=keepdim)
+    powers = torch.where(size == 0, 0.0 if ord > 0 else torch.inf, size**ord)  # without a derivative at 0, as PyTorch's
+    total = powers.sum(dims, keepdim=keepdim)
     return torch.where(total == 0, 0.0, total ** (1.0 / ord))  # at 0 the derivative is 0, as PyTorch's
 
 
@@ -260,6 +266,8 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "aten._log_softmax": _log_softmax,
     "aten.var": lambda *args, **more: _var_mean(*args, **more)[0],
     "aten.var_mean": _var_mean,
+    "aten.std": lambda *args, **more: _std_mean(*args, **more)[0],
+    "aten.std_mean": _std_mean,
     "aten.native_layer_norm": _layer_norm,
     "aten.native_group_norm": _group_norm,
     "aten._native_batch_norm_legit_no_training": _batch_norm,
