@@ -15,6 +15,7 @@ import torchgco
 from tests.slow import mostly
 from torchgco import (
     BetweenKnots,
+    Constraint,
     ControlBounds,
     Cost,
     Dynamics,
@@ -316,3 +317,30 @@ def test_a_branch_within_stages_is_raised() -> None:
     p = Problem(model, FunctionCost(stage, lambda x: 60.0 * end(x)), [BetweenKnots(kind)], [[0.0, 0.0]], N)
     with pytest.raises(InputError, match=r"speed\.function: expected rows of one knot .* by itself"):
         solved(p, "interior_point")
+
+
+@dataclass(frozen=True)
+class Below(Constraint):
+    """v <= 2, or <= 1 where x is over 1 at any knot that `value` sees."""
+
+    knots: Any = None
+    sense: Any = "inequality"
+
+    def bind(self, dims: Any) -> Below:
+        return Below(slice(1, dims.N + 1))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return X[:, 1:, 1:] - (1.0 if bool((X[..., 0] > 0.5).any()) else 2.0)
+
+
+def test_rows_of_a_class_are_evaluated_knot_by_knot() -> None:
+    p = Problem(FunctionDynamics(field, 2, 1, DT), FunctionCost(stage, end), [Below()], [[0.0, 0.0]], N)
+    U = torch.tensor([[[7.0], [-1.0], [-1.0]]]).double()
+    x, worst = p.x0, 0.0
+    for u in U[0].split(1):
+        x = x + DT * field(x, u)
+        worst = max(worst, float(x[0, 1]) - (1.0 if float(x[0, 0]) > 0.5 else 2.0))
+    assert float(torchgco.judge(p, U).violation) == pytest.approx(worst, rel=1e-12)
+    p = Problem(p.dynamics, FunctionCost(stage, lambda x: 60.0 * end(x)), [Below()], [[0.0, 0.0]], N)
+    with pytest.raises(InputError, match=r"constraints\[0\]\.value: expected rows of one knot .* by itself"):
+        solved(p)

@@ -104,6 +104,8 @@ def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values
         if bound is not other:
             rows = bound.constraint if isinstance(bound, BetweenKnots) else bound
             field, wanted = f"constraints[{i}].value", OWN_ROW
+            if not rows.joins_knots:
+                wanted = ONE_KNOT
             if isinstance(rows, FunctionConstraint | Integral):
                 field, wanted = f"{rows.name}.function", OF_STAGE if isinstance(rows, Integral) else ONE_KNOT
             yield field, wanted, lambda p, X, U, _, i=i: p.constraints[i].value(X, U)
@@ -159,8 +161,9 @@ def _rows_alone(part: Any) -> Any:
     """A constraint whose code sees each row by itself, and so does what it evaluates between the knots."""
     if isinstance(part, FunctionConstraint):
         return _made(part, _Function)
-    made = _made(part, _Integral if isinstance(part, Integral) else _Constraint)
-    if is_users(model := getattr(made, "model", None)):
+    whole = part.joins_knots or isinstance(part, BetweenKnots)
+    made = _made(part, _Integral if isinstance(part, Integral) else _Constraint if whole else _Rows)
+    if isinstance(part, BetweenKnots | Integral) and is_users(model := part.model):
         object.__setattr__(made, "model", _made(model, _Field if type(model).step is Dynamics.step else _Step))
     if isinstance(part, BetweenKnots) and is_users(part.constraint):
         object.__setattr__(made, "constraint", _rows_alone(part.constraint))
@@ -242,6 +245,19 @@ class _Constraint(Constraint):
 
     def _of_each(self, name: str, X: Tensor, U: Tensor) -> Tensor:
         return torch.cat([getattr(self.take(_one(b)), name)(X[_one(b)], U[_one(b)]) for b in range(len(X))])
+
+
+class _Rows(_Constraint):
+    """Rows of a knot, which read that knot alone: each along a trajectory that stays there."""
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        if len(X) > 1:
+            return self._of_each("value", X, U)
+        rows = []
+        for i, k in enumerate(torch.arange(X.shape[1])[self.knots].tolist()):
+            stage = slice(min(k, U.shape[1] - 1), min(k, U.shape[1] - 1) + 1)
+            rows.append(super().value(X[:, k : k + 1].expand_as(X), U[:, stage].expand_as(U))[:, i])
+        return torch.stack(rows, dim=1)
 
 
 class _Integral(_Constraint, Integral):
