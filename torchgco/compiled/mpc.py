@@ -111,7 +111,10 @@ class MPC:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the plan, and begin at time 0 again: the next step solves as the first one does."""
+        """Forget the plan, and begin at time 0 again: the next step solves as the first one does.
+
+        Numbers that steps were given stay, but for controls before and places of what moves.
+        """
         self.t, self.answer, self._plan = 0.0, None, None
         self._held = np.zeros(self._problem.B, dtype=bool)
         self._feasible, self._unlooked = np.zeros((2, self._problem.B), dtype=bool)
