@@ -245,6 +245,9 @@ def test_a_status_counts_what_lies_at_its_limit() -> None:
     status = final_status(ended, left, violation, 1e-3, constrained=True)
     want = [Status.CONVERGED, Status.FEASIBLE, Status.MAX_ITERATIONS, Status.NOT_POSITIVE_DEFINITE]
     assert [Status(int(s)) for s in status] == want
+    late = final_status(torch.full_like(ended, Status.TIME_LIMIT), left, violation, 1e-3, constrained=True)
+    want[2:] = [Status.TIME_LIMIT] * 2  # with more time there might be gains
+    assert [Status(int(s)) for s in late] == want
 
 
 @pytest.mark.parametrize("solver", ["interior_point", "al_ilqr"])

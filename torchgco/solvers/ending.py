@@ -175,7 +175,8 @@ def final_status(ended: Tensor, left: Tensor, violation: Tensor, tolerance: floa
     status = torch.where(stationary & (violation <= tolerance), int(Status.CONVERGED), status)
     status = torch.where(~fits & ((ended == STALLED) | (ended == UNMOVED)), int(Status.INFEASIBLE), status)
     status = torch.where(torch.isinf(left) & ~over, int(Status.NOT_POSITIVE_DEFINITE), status)
-    status = torch.where((ended == Status.TIME_LIMIT) & ~fits, ended, status)  # more time might find more
+    lost = ~fits | torch.isinf(left)
+    status = torch.where((ended == Status.TIME_LIMIT) & lost, ended, status)  # more time might find more
     failed = (ended == Status.NON_FINITE) | (ended == Status.NOT_POSITIVE_DEFINITE) | (ended == Status.INVALID_START)
     return torch.where(failed, ended, status)
 
