@@ -239,7 +239,7 @@ def compare(
         A row per solver and problem, with index `solver` and `element`: the columns of `Solution.to_frame(problem)`;
         `cost_ratio` to the cheapest trajectory of the problem that is as good (its goal reached, where that is judged,
         else feasible), NaN for those that aren't, and where the least cost isn't above 0; `seconds` per problem, those
-        of the whole solve divided by B, without compiling.
+        of the whole solve divided by B, without compiling; the `threads` and the `device` that they were measured on.
 
     Raises:
         InputError: as `solve`; no solver, or two of the same name.
@@ -259,7 +259,8 @@ def compare(
             torch.cuda.synchronize(problem.x0.device)
         seconds = (clock.seconds() - began) / max(1, problem.B)
         frame, sound = _judged_frame(problem, found)
-        frames.append(frame.assign(solver=name, seconds=seconds).reset_index())
+        on = {"threads": torch.get_num_threads(), "device": str(problem.x0.device)}
+        frames.append(frame.assign(solver=name, seconds=seconds, **on).reset_index())
         feasible.append(sound.cpu())
     table = pd.concat(frames, ignore_index=True)
     good = table["reached"] if "reached" in table else pd.Series(torch.cat(feasible).numpy())

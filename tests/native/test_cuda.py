@@ -116,6 +116,7 @@ def test_a_problem_of_a_device_is_served_there(monkeypatch) -> None:
     with SecondDevice():
         solution = torchgco.solve(*problem_of(OTHER), "interior_point", verbose=False)
         assert solution.X.device == OTHER and numbers(solution) == numbers(expected)
+        assert [one.account and one.account.kernels for one in (expected, solution)] == ["native", "cuda"]
     assert "kernel_tgco_interior" in shims.launched
 
 
@@ -162,8 +163,8 @@ def test_without_a_device_there_are_no_kernels() -> None:
 def test_few_problems_are_solved_by_the_cpu() -> None:
     problem, U0 = problem_of("cpu")
     with shimmed(least=3) as shims:
-        torchgco.solve(problem, U0, "interior_point", verbose=False)
-    assert not shims.made
+        solution = torchgco.solve(problem, U0, "interior_point", verbose=False)
+    assert not shims.made and solution.to_frame()["kernels"].tolist() == ["native"] * 2
     with shimmed(least=8) as shims:  # as many threads as samples, of which there is one of the CPU for a problem
         SAMPLERS["free"].improved(problem, U0, key(2))
     assert "sample_fly" in shims.launched

@@ -24,7 +24,7 @@ from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.cuda.compiler import Loaded, available
-from torchgco.native.cuda.engine import OnDevice, working_on
+from torchgco.native.cuda.engine import OnDevice, has_served, working_on
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import begin_interior
@@ -33,6 +33,7 @@ from torchgco.problem.problem import Problem
 from torchgco.tracing import CAPTURED, Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
+ON_DEVICE = "cuda"  # kernels of which some have run on a GPU
 CURRENT, OWN = "current", "own tensors"  # what a problem keeps of its solves: see `current`
 
 
@@ -174,8 +175,10 @@ def _warn(warned: set[str], error: Exception) -> None:
 
 
 def used(problem: Problem) -> str:
-    """The name of the kernels that have worked on problems of this form."""
-    return NativeKernels.name if problem.known.in_c and native() else Kernels.name
+    """The name of the kernels that have worked on problems of this form: `ON_DEVICE` if a GPU has served them, too."""
+    if not problem.known.in_c or not native():
+        return Kernels.name
+    return ON_DEVICE if has_served() else NativeKernels.name
 
 
 def expect_interior(problem: Problem) -> None:

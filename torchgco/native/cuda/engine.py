@@ -40,6 +40,7 @@ class OnDevice:
 
 
 _device: ContextVar[OnDevice | None] = ContextVar("_device", default=None)
+_launched: ContextVar[set[str] | None] = ContextVar("_launched", default=None)  # functions, in the present block
 
 
 def current_device() -> OnDevice | None:
@@ -50,11 +51,17 @@ def current_device() -> OnDevice | None:
 @contextmanager
 def working_on(device: OnDevice | None) -> Iterator[None]:
     """In this block kernels are made for a device."""
-    before = _device.set(device)
+    before, launched = _device.set(device), _launched.set(set())
     try:
         yield
     finally:
         _device.reset(before)
+        _launched.reset(launched)
+
+
+def has_served() -> bool:
+    """Whether a device has served a function in the present block of `working_on`."""
+    return bool(_launched.get())
 
 
 class Library:
@@ -112,6 +119,8 @@ class Kernel:
             told = f"solved by C on the CPU, and not on the device: {str(error).splitlines()[0]}"
             warnings.warn(told, DeviceWarning, stacklevel=2)
             return False
+        if (launched := _launched.get()) is not None:
+            launched.add(self.name)
         return True
 
     def _run(self, argument: Any, first: int, last: int) -> None:
