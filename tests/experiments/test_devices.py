@@ -1,4 +1,4 @@
-"""Studies on a device with a number, and on several: testable on CPUs, which count as devices where they are told to."""
+"""Studies on a device with a number, and on several: CPUs count as devices where a test says so."""
 
 from __future__ import annotations
 
@@ -49,14 +49,15 @@ def test_a_device_may_have_a_number(word: str, words: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "told"), [(0, r"\(no CUDA device\)"), (1, r"\(cuda:0, 1 in all\)"), (2, r"\(cuda:0 to cuda:1, 2 in all\)")]
+    ("count", "told"), [(0, "no CUDA device"), (1, "cuda:0, 1 in all"), (2, "cuda:0 to cuda:1, 2 in all")]
 )
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
 def test_an_absent_device_is_refused_with_how_many_there_are(count: int, told: str, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
     for call in (lambda: compose(["device=cuda:7"]), lambda: check_device("cuda:7")):
-        with pytest.raises(InputError, match=rf"device: expected a device that is there, such as cpu {told}, got cuda:7"):
+        with pytest.raises(InputError) as caught:
             call()
+        assert str(caught.value) == f"device: expected a device that is there, such as cpu ({told}), got cuda:7"
 
 
 def test_a_command_with_an_absent_or_misspelt_device_ends_in_a_line(run) -> None:

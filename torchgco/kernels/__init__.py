@@ -11,6 +11,7 @@ from torchgco.kernels.choice import copied_to as copied_to
 from torchgco.kernels.choice import current as current
 from torchgco.kernels.choice import expect_interior as expect_interior
 from torchgco.kernels.choice import held_on_cpu as held_on_cpu
+from torchgco.kernels.choice import is_mixed as is_mixed
 from torchgco.kernels.choice import kernels_of as kernels_of
 from torchgco.kernels.choice import native as native
 from torchgco.kernels.choice import on_cpu as on_cpu

@@ -19,6 +19,7 @@ from torchgco.base.errors import DeviceWarning, InputError
 from torchgco.base.gradients import is_forward, nodes
 from torchgco.base.memory import trim
 from torchgco.base.shapes import CPU, computing_on
+from torchgco.base.together import Together
 from torchgco.base.tree import PerElement, field_names, is_users, mapped
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
@@ -218,13 +219,13 @@ def on_cpu(problem: Problem) -> Problem | None:
     """The problem on the CPU in float64, where it lies on another device and C serves it on the CPU; else None.
 
     A DeviceWarning says so once in a process. A problem stays where the process has chosen PyTorch's kernels
-    (`use_native`), and where code can't be traced on the CPU, as that of a function which holds a tensor of its device.
+    (`use_native`), and where code can't be traced on the CPU. What functions hold on its device is read from there.
     """
     device = problem.x0.device
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
     there = _copied(problem)
-    with computing_on(CPU), served_by(device):
+    with computing_on(CPU), served_by(device, False):
         if not serves(there):
             return None
     global _said
@@ -253,16 +254,25 @@ def on_device(device: torch.device) -> OnDevice | None:
     return OnDevice(partial(Loaded, device=device)) if device.type == "cuda" and available() else None
 
 
+def is_mixed(problem: Problem) -> bool:
+    """Whether functions of a problem on the CPU, which C serves, hold tensors of another device."""
+    return bool(problem.known.in_c) and problem.known.in_c.engine.captured.is_elsewhere
+
+
 @contextmanager
-def served_by(device: torch.device) -> Iterator[None]:
-    """In this block what iterates on many problems runs on a device, if that has kernels."""
+def served_by(device: torch.device, mixed: bool) -> Iterator[None]:
+    """In this block what iterates on many problems runs on a device, if that has kernels.
+
+    Args:
+        mixed: of the problem on the CPU, see `is_mixed`.
+    """
     kernels = on_device(device) if native() else None
-    with nullcontext() if kernels is None else working_on(kernels):
+    with Together(CPU) if mixed else nullcontext(), nullcontext() if kernels is None else working_on(kernels):
         yield
 
 
 def _copied(problem: Problem) -> Problem:
-    """The problem without gradients; what users' functions hold stays where it is."""
+    """The problem without gradients; what users' functions hold stays where it is, see `base.together`."""
     change = lambda leaf: leaf.detach().to(CPU, torch.float64 if leaf.is_floating_point() else leaf.dtype)
     parts = {name: mapped(getattr(problem, name), change) for name in field_names(type(problem))}
     return problem._with(parts)

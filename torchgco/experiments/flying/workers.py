@@ -83,7 +83,8 @@ def _run_pool(
 ) -> None:
     """Run the jobs that are left by one pool and remove those with a result; returns early where it broke."""
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, (*begin, CONTEXT.Value("i", 0)))
+    arguments: Any = *begin, CONTEXT.Value("i", 0)
+    pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, arguments)
     try:
         with raised() as noted:
             with _interrupts_held(noted):
