@@ -7,6 +7,7 @@ problems of a GPU to the CPU, and has their loops run on the GPU. It imports `na
 """
 
 from torchgco.kernels.choice import EagerWarning as EagerWarning
+from torchgco.kernels.choice import at_once as at_once
 from torchgco.kernels.choice import copied_to as copied_to
 from torchgco.kernels.choice import current as current
 from torchgco.kernels.choice import expect_interior as expect_interior

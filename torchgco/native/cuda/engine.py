@@ -23,6 +23,9 @@ from torchgco.native.cuda.source import Program, source
 # Problems or samples, for each thread of the CPU that has some, from which on a device is asked. An estimate: 256
 # threads of an H200 are as fast as one core or two.
 LEAST = 512
+# Problems of one call at least: about as many as an H200 has threads at the same time, 132 multiprocessors with
+# `launch.BLOCKS` blocks each.
+AT_ONCE = 2**15
 SIZES = {"double": 8, "float": 4}  # bytes
 
 
@@ -46,6 +49,12 @@ _launched: ContextVar[set[str] | None] = ContextVar("_launched", default=None)  
 def current_device() -> OnDevice | None:
     """What serves problems on a device now; None: all are solved on the CPU."""
     return _device.get()
+
+
+def at_once(most: int) -> int:
+    """How many problems are worked on together: `most`, which bounds memory and the time between two reports; where a
+    device serves, with a thread for each, more."""
+    return most if current_device() is None else max(most, AT_ONCE)
 
 
 @contextmanager
