@@ -52,7 +52,7 @@ def forests(repeats: int) -> Problem:
 
 
 @pytest.mark.filterwarnings("ignore::torchgco.HorizonWarning", "ignore::torchgco.StepWarning")
-@pytest.mark.parametrize("solver", mostly(["interior_point", "gco", "al_ilqr"], "gco", "al_ilqr", several=True))
+@pytest.mark.parametrize("solver", mostly(["interior_point", "gco", "al_ilqr"], "gco", "al_ilqr"))
 def test_values_are_not_read_for_each_problem(solver: str) -> None:
     made = []
     for repeats in (1, 8):
