@@ -40,6 +40,7 @@ def two_devices(monkeypatch) -> None:
     [
         ("device=cuda:1", ["device=cuda", "device.name=cuda:1"]),
         ("device=cuda:0,cuda:1", ["device=cuda", "device.name=cuda:0,cuda:1"]),
+        ("device=cuda\\:1", ["device=cuda", "device.name=cuda:1"]),
         ("device=cuda", ["device=cuda"]),
         ("device.name=cuda:1", ["device.name=cuda:1"]),
     ],

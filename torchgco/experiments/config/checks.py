@@ -38,7 +38,7 @@ def hydra_words(words: Iterable[str]) -> list[str]:
 def _of_numbered(word: str) -> list[str]:
     """A word for a device, or a sweep over some, with the number of each, such as `device=cuda:1`, as two words: Hydra
     has a file for its kind alone."""
-    numbered = re.fullmatch(r"device=((?:cuda:\d+,?)+)", word)
+    numbered = re.fullmatch(r"device=((?:cuda:\d+,?)+)", word.replace("\\:", ":"))  # as a sweep writes its jobs' words
     return [word] if numbered is None else ["device=cuda", f"device.name={numbered[1]}"]
 
 
