@@ -27,6 +27,7 @@ from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.cuda.compiler import Loaded, available
 from torchgco.native.cuda.engine import OnDevice, has_served, working_on
 from torchgco.native.cuda.engine import at_once as at_once
+from torchgco.native.cuda.engine import current_device as current_device
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import begin_interior
