@@ -27,10 +27,15 @@ def together(
 
     Copies from device to device, and what writes into its arguments, stay as they are.
     """
-    away = lambda leaf: isinstance(leaf, Tensor) and leaf.device != device
+    away = lambda leaf: isinstance(leaf, Tensor) and leaf.device != device and not _is_empty(leaf)
     if not any(map(away, leaves((args, kwargs)))) or func is torch.ops.aten._to_copy.default or func._schema.is_mutable:
         return args, kwargs
     return mapped_arguments(lambda leaf: copy(leaf, device) if away(leaf) else leaf, (args, kwargs))
+
+
+def _is_empty(tensor: Tensor) -> bool:
+    """Whether a tensor has a shape alone, as PyTorch's decompositions make some."""
+    return type(tensor) is Tensor and tensor.is_meta
 
 
 def mapped_arguments(function: Callable[[Any], Any], tree: Any) -> Any:

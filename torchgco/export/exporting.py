@@ -79,8 +79,7 @@ def export_c(
         raise InputError("name", "a word of C, such as controller", shown(name))
     if isinstance(problem, Compiled):
         changes = problem.changes if changes is None else changes
-        with served_by(*problem.origin):
-            compiled = compile(problem.now, "interior_point", tolerance=problem.interior.tolerance)
+        compiled = _compiled_again(problem)
     else:
         compiled = compile(_checked(problem), "interior_point")
     kept = _served(compiled)
@@ -96,6 +95,12 @@ def export_c(
     solver = solver_source(kept, some, compiled.interior, rest, BYTES[dtype])
     exported = Exported(compiled, kept, solver, some, name, receding, BYTES[dtype])
     return write_files(exported, Path(folder), build)
+
+
+def _compiled_again(problem: Compiled) -> Compiled:
+    """The problem as it is now, for the interior point."""
+    with served_by(*problem.origin):
+        return compile(problem.now, "interior_point", tolerance=problem.interior.tolerance)
 
 
 def _checked(problem: Problem) -> Problem:
