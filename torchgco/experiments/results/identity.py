@@ -62,7 +62,7 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
 
 def kind_of(configuration: Mapping[str, Any]) -> str:
     """The kind of a configuration's device, "cpu" or "cuda": which of several it is decides no result."""
-    return str(configuration["device"]["name"]).partition(":")[0]
+    return str(configuration["device"].get("name")).partition(":")[0]
 
 
 def closed_loop(configuration: Mapping[str, Any]) -> dict[str, Any]:
