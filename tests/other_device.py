@@ -60,9 +60,11 @@ class SecondDevice:
 
     Attributes:
         moved: places in the package, "file:line", from which tensors were brought to the CPU or from it.
+        moves: how often.
     """
 
     moved: set[str] = field(default_factory=set)
+    moves: int = 0
 
     def __enter__(self) -> SecondDevice:
         self._modes = _Made(), _Run(self)
@@ -118,6 +120,7 @@ class _Run(TorchDispatchMode):
             result_there = there and device is None
         if moves and len({isinstance(value, Elsewhere) for value in tensors} | {result_there}) > 1:
             self.device.moved.add(_place())
+            self.device.moves += 1
         elif there and not moves:
             mixing = tensors[:1] if func._overloadpacket in INDEXED else tensors  # indices may lie on the CPU
             strange = [value for value in mixing if not isinstance(value, Elsewhere) and value.dim() > 0]

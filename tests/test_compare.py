@@ -18,7 +18,9 @@ def test_each_row_is_that_of_a_solve_alone() -> None:
     for name in ("hold", "al_ilqr"):
         alone = torchgco.solve(problem, U0, solver=name).to_frame(problem)
         assert table.loc[name, list(alone.columns)].equals(alone)
-        assert (table.loc[name, "seconds"] > 0).all()
+        assert (table.loc[name, "seconds"] > 0).all() and set(table.loc[name, "kernels"]) == {"native"}
+        assert set(table.loc[name, "device"]) == {"cpu"}
+        assert set(table.loc[name, "threads"]) == {torch.get_num_threads()}
     good = table[table["reached"]] if table["reached"].any() else table.iloc[:0]
     assert table.loc[~table["reached"], "cost_ratio"].isna().all()
     for _, rows in good.groupby("element"):

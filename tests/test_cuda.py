@@ -18,6 +18,7 @@ from torch import Tensor
 import torchgco
 from benchmarks.families.general_problems import FAMILIES
 from tests.problems import planar_batch
+from tests.test_elsewhere import learned
 from tests.test_other_device import problem_of
 from torchgco import (
     GCO,
@@ -156,6 +157,15 @@ def test_c_on_the_cpu_solves_problems_of_the_device() -> None:
         grads.append((solution.X.detach().cpu(), x0.grad.cpu()))
     assert torch.equal(grads[0][0], grads[1][0])
     torch.testing.assert_close(grads[0][1], grads[1][1], rtol=1e-6, atol=1e-9)
+
+
+def test_c_on_the_cpu_reads_what_functions_hold_on_the_device() -> None:
+    use_native(True)
+    found = [torchgco.solve(learned(device)[0], verbose=False) for device in ("cpu", "cuda")]
+    assert [one.account and one.account.kernels for one in found] == ["native", "native"]
+    assert found[1].X.device.type == "cuda" and torch.equal(found[0].X, found[1].X.cpu())
+    answers = [torchgco.compile(learned(device)[0], "interior_point")(x0=[[0.0] * 4] * 2) for device in ("cpu", "cuda")]
+    assert torch.equal(answers[0].X, answers[1].X)
 
 
 def on_the_device() -> AbstractContextManager[None]:

@@ -4,14 +4,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 import torchgco
 from tests.other_device import OTHER, SecondDevice
-from torchgco import ControlBounds, DeviceWarning, FunctionConstraint, Goal, Planar, Problem, QuadraticCost, Spheres
+from torchgco import (
+    ControlBounds,
+    DeviceWarning,
+    FunctionConstraint,
+    FunctionDynamics,
+    Goal,
+    Planar,
+    Problem,
+    QuadraticCost,
+    Spheres,
+)
 from torchgco.kernels import choice, use_native
 
 DOUBLE: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}
@@ -70,14 +82,98 @@ def test_single_precision_is_solved_in_double() -> None:
         assert solution.X.dtype == torch.float32 and solution.X.tolist() == expected.X.float().tolist()
 
 
-def test_code_that_holds_a_tensor_of_the_device_stays_there() -> None:
+def learned(device: Any, B: int = 2) -> tuple[Problem, list[torch.Tensor]]:
+    """A model with a network, whose weights lie on the device, in a gap; and the weights."""
+    draw = torch.Generator().manual_seed(0)
+    sizes = (16, 6), (16,), (4, 16), (4,)
+    weights = [torch.randn(size, generator=draw, dtype=torch.float64).mul(0.1).to(device) for size in sizes]
+
+    def rates(x: Any, u: Any) -> Any:
+        A, a, C, c = weights
+        z = torch.cat((x, u), -1)
+        push = torch.nn.functional.linear(torch.nn.functional.linear(z, A, a).tanh(), C, c)
+        return torch.cat((x[..., 2:], u), -1) + push
+
+    put = lambda value: torch.tensor(value, **DOUBLE).to(device)
+    most = put([1.5])
+    parts = [
+        Spheres(put([[0.5, 0.05]]), put([0.2]), 0.1), ControlBounds(put([-4.0, -4]), put([4.0, 4])),
+        FunctionConstraint(lambda x: x[..., 2:3] - most),
+    ]  # fmt: skip
+    cost = QuadraticCost(put([0.1, 0.1, 0, 0]), put([0.1, 0.1]), put([50, 50, 1, 1]), put([1.0, 0, 0, 0]))
+    model = FunctionDynamics(rates, 4, 2, 0.1, position=slice(0, 2))
+    x0 = torch.zeros(B, 4, **DOUBLE).to(device)
+    return Problem(model, cost, parts, x0, 12, Goal(put([1.0, 0.0]), 0.3)), weights
+
+
+@pytest.mark.parametrize("solver", ["interior_point", "al_ilqr", "gco"])
+def test_code_that_holds_tensors_of_the_device_is_served_too(solver: str) -> None:
+    """Weights of a network, read from the device at every solve, as they are by then."""
+    expected = [numbers(torchgco.solve(learned("cpu")[0], solver=solver, verbose=False))]
+    problem, weights = learned("cpu")
+    weights[1] += 0.01
+    expected.append(numbers(torchgco.solve(problem, solver=solver, verbose=False)))
     with SecondDevice(), warnings.catch_warnings():
-        warnings.simplefilter("error", DeviceWarning)
-        most = torch.tensor([2.0], dtype=torch.float64, device=OTHER)
-        problem, U0 = problem_of(OTHER, FunctionConstraint(lambda x: x[..., 3:4] - most))
+        warnings.simplefilter("ignore", DeviceWarning)
+        problem, weights = learned(OTHER)
+        found = []
+        for step in (0.0, 0.01):
+            weights[1] += step
+            solution = torchgco.solve(problem, solver=solver, verbose=False)
+            assert solution.account is not None and solution.account.kernels == "native" and solution.X.device == OTHER
+            found.append(numbers(solution))
+    assert found == expected and found[0] != found[1]
+
+
+@pytest.mark.parametrize("solver", ["interior_point", "gco"])
+def test_loops_hold_a_network_of_the_device(solver: str) -> None:
+    controls = []
+    for device in ("cpu", OTHER):
+        with SecondDevice(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeviceWarning)
+            problem, _ = learned(device, B=1)
+            call, loop = torchgco.compile(problem, solver), torchgco.MPC(problem, solver)
+            x = np.zeros((1, 4))
+            controls.append([call(x0=x + 0.01 * i).U.tolist() for i in range(2)])
+            controls[-1] += [np.asarray(loop.step(x)).tolist() for _ in range(2)]
+            controls[-1].append(torchgco.MPPIController(problem, torchgco.MPPI(samples=20)).command(x).tolist())
+    assert controls[0] == controls[1]
+
+
+def test_solutions_with_a_network_of_the_device_have_gradients() -> None:
+    """What leads to them is recorded on the device; backward passes have no second device without hardware."""
+    found = []
+    for device in ("cpu", OTHER):
+        with SecondDevice(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeviceWarning)
+            problem, _ = learned(device)
+            x0 = problem.x0.clone().requires_grad_()
+            solution = torchgco.solve(replace(problem, x0=x0), solver="interior_point", verbose=False)
+            assert solution.X.requires_grad and solution.X.device == problem.x0.device
+            assert all(solution.differentiable.tolist())
+            found.append(torch.tensor(solution.detach().X.tolist(), **DOUBLE))
+    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-9)  # with the last step of Newton's method, by PyTorch there
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_exported_c_has_the_numbers_of_the_device(compiled: bool, tmp_path) -> None:
+    texts = []
+    for device in ("cpu", OTHER):
+        with SecondDevice(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeviceWarning)
+            problem, _ = learned(device, B=1)
+            given = torchgco.compile(problem, "interior_point", receding=True) if compiled else problem
+            folder = torchgco.export_c(given, tmp_path / str(device), "own")
+            texts.append({path.name: path.read_text() for path in sorted(folder.iterdir()) if path.is_file()})
+    assert texts[0] == texts[1] and "own.c" in texts[0]
+
+
+def test_code_that_writes_into_a_tensor_of_the_device_is_not_traced() -> None:
+    """A copy would be written to in its place."""
+    with SecondDevice():
+        count = torch.zeros(1, dtype=torch.float64, device=OTHER)
+        problem, _ = problem_of(OTHER, FunctionConstraint(lambda x: x[..., 3:4] - 9.0 - 0.0 * count.add_(1.0)))
         assert choice.on_cpu(problem) is None
-        solution = torchgco.solve(problem, U0, torchgco.AugmentedLagrangian(max_outer_iterations=1), verbose=False)
-        assert solution.account is not None and solution.account.kernels == "pytorch" and solution.X.device == OTHER
 
 
 def test_chosen_kernels_stay_there() -> None:

@@ -23,7 +23,7 @@ from torchgco.fleets import Fleet, FleetSolution
 from torchgco.fleets.solve import solve_fleet
 from torchgco.guesses import Guess, guesses_of, solve_guesses
 from torchgco.judging.judge import judge, judged_columns
-from torchgco.kernels import copied_to, current, on_cpu, open_loop, served_by
+from torchgco.kernels import copied_to, current, is_mixed, on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.phases import Phases, PhasesSolution
 from torchgco.phases.solution import solve_phases
@@ -144,7 +144,7 @@ def solve(
     solver, X0 = _solver(solver, problem, record), warm.X if X0 is None and warm and problem.time else X0
     if solver.kernels is None and (there := on_cpu(problem)) is not None:
         problem, (U0, ids, warm, X0, tried) = there, copied_to((U0, ids, warm, X0, tried), there.x0)
-    with served_by(asked.x0.device):
+    with served_by(asked.x0.device, is_mixed(problem)):
         problem, U0 = spared(problem, partial(_start, warm, solver, U0))
         multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
         watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
@@ -239,7 +239,7 @@ def compare(
         A row per solver and problem, with index `solver` and `element`: the columns of `Solution.to_frame(problem)`;
         `cost_ratio` to the cheapest trajectory of the problem that is as good (its goal reached, where that is judged,
         else feasible), NaN for those that aren't, and where the least cost isn't above 0; `seconds` per problem, those
-        of the whole solve divided by B, without compiling.
+        of the whole solve divided by B, without compiling; the `threads` and the `device` that they were measured on.
 
     Raises:
         InputError: as `solve`; no solver, or two of the same name.
@@ -259,7 +259,8 @@ def compare(
             torch.cuda.synchronize(problem.x0.device)
         seconds = (clock.seconds() - began) / max(1, problem.B)
         frame, sound = _judged_frame(problem, found)
-        frames.append(frame.assign(solver=name, seconds=seconds).reset_index())
+        on = {"threads": torch.get_num_threads(), "device": str(problem.x0.device)}
+        frames.append(frame.assign(solver=name, seconds=seconds, **on).reset_index())
         feasible.append(sound.cpu())
     table = pd.concat(frames, ignore_index=True)
     good = table["reached"] if "reached" in table else pd.Series(torch.cat(feasible).numpy())

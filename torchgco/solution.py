@@ -226,7 +226,7 @@ class Solution:
     def to_frame(self, problem: Problem | None = None) -> pd.DataFrame:
         """One row per problem: status, cost, violation and the iteration counts; horizon and guess where they differ.
 
-        Where it is known, `kernels` says what solved: "native", "pytorch", or another library's name.
+        Where it is known, `kernels` says what solved: "native", "cuda" (C on a GPU, too), "pytorch", or another one.
 
         Args:
             problem: the problem that was solved. With it come the columns of `judge.columns`, from a re-simulation:

@@ -26,7 +26,7 @@ from tests.native.test_sampler import PROBLEMS as SAMPLED
 from tests.native.test_sampler import SAMPLERS, key
 from tests.other_device import OTHER, SecondDevice
 from tests.slow import mostly
-from tests.test_elsewhere import numbers, problem_of
+from tests.test_elsewhere import learned, numbers, problem_of
 from torchgco import DeviceWarning, Problem
 from torchgco.kernels import choice
 from torchgco.native.compiler import NativeError, find_compiler
@@ -116,7 +116,20 @@ def test_a_problem_of_a_device_is_served_there(monkeypatch) -> None:
     with SecondDevice():
         solution = torchgco.solve(*problem_of(OTHER), "interior_point", verbose=False)
         assert solution.X.device == OTHER and numbers(solution) == numbers(expected)
+        assert [one.account and one.account.kernels for one in (expected, solution)] == ["native", "cuda"]
     assert "kernel_tgco_interior" in shims.launched
+
+
+@pytest.mark.parametrize("solver", mostly(["al_ilqr", "interior_point"], "interior_point"))
+def test_a_network_of_a_device_is_served_there(solver: str, monkeypatch) -> None:
+    """Its weights are numbers of the device, which the kernels read in the order of C's sums."""
+    expected, shims = numbers(torchgco.solve(learned("cpu")[0], solver=solver, verbose=False)), Shims()
+    served = OnDevice(shims, 1)
+    monkeypatch.setattr(choice, "on_device", lambda device: served if device.type == OTHER.type else None)
+    with SecondDevice():
+        solution = torchgco.solve(learned(OTHER)[0], solver=solver, verbose=False)
+        assert solution.to_frame()["kernels"].tolist() == ["cuda"] * 2 and numbers(solution) == expected
+    assert shims.launched & {"kernel_tgco_outer", "kernel_tgco_interior"}
 
 
 def test_commands_of_a_device_are_sampled_there(monkeypatch) -> None:
@@ -162,8 +175,8 @@ def test_without_a_device_there_are_no_kernels() -> None:
 def test_few_problems_are_solved_by_the_cpu() -> None:
     problem, U0 = problem_of("cpu")
     with shimmed(least=3) as shims:
-        torchgco.solve(problem, U0, "interior_point", verbose=False)
-    assert not shims.made
+        solution = torchgco.solve(problem, U0, "interior_point", verbose=False)
+    assert not shims.made and solution.to_frame()["kernels"].tolist() == ["native"] * 2
     with shimmed(least=8) as shims:  # as many threads as samples, of which there is one of the CPU for a problem
         SAMPLERS["free"].improved(problem, U0, key(2))
     assert "sample_fly" in shims.launched

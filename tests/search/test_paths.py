@@ -1,10 +1,12 @@
 """Proposals along paths: they lead to the goal, report where there is none, and count their iterations."""
 
 import math
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pkgutil import resolve_name
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,9 +32,11 @@ from torchgco import (
 from torchgco.dynamics.rollout import open_loop
 from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.maps import OccupancyGrid
+from torchgco.native.cuda.engine import OnDevice, working_on
 from torchgco.roadmap.geometry import Inflated
 from torchgco.roadmap.homotopy import classes
 from torchgco.search import Follow, Refine
+from torchgco.search.proposals import Part
 from torchgco.solvers.ilqr import descend
 
 
@@ -113,6 +117,29 @@ def test_chunks_change_no_result(monkeypatch) -> None:
     parts = proposed(two, problem)
     assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)
     assert torch.equal(whole.multipliers.mu, parts.multipliers.mu) and torch.equal(whole.iterations, parts.iterations)
+
+
+def test_paths_are_sought_ahead_where_a_device_solves(monkeypatch) -> None:
+    """By another thread, with the same bits; errors in it are raised, and nothing is left behind."""
+    problem, two = cups(N=40), varied(QUICK, num_paths=2, iterations=2, relax_iterations=1)
+    whole, threads, sought = proposed(two, problem), set[str](), Part._sought
+
+    def noted(part: Part, *words: Any) -> Any:
+        threads.add(threading.current_thread().name)
+        return sought(part, *words)
+
+    monkeypatch.setattr("torchgco.search.proposals.PATHS_AT_ONCE", 2)
+    monkeypatch.setattr(Part, "_sought", noted)
+    proposed(two, problem)
+    assert threads == {threading.main_thread().name}
+    with working_on(OnDevice(lambda text: pytest.fail("nothing is compiled"), 10**9)):
+        parts = proposed(two, problem)
+        assert len(threads) == 2
+        monkeypatch.setattr(Part, "_sought", lambda part, *words: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            proposed(two, problem)
+    assert torch.equal(whole.U, parts.U) and torch.equal(whole.found, parts.found)
+    assert torch.equal(whole.iterations, parts.iterations) and len(problem.x0) > 1
 
 
 def test_a_proposal_is_the_same_in_every_batch() -> None:

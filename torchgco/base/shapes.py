@@ -119,11 +119,13 @@ def check_untransformed(what: str) -> None:
 
 
 def check_device(device: Any) -> torch.device:
-    """The device by its name; InputError where there is none, or PyTorch can't use it."""
+    """The device by its name; InputError, which tells those that there are, where PyTorch can't use it."""
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError, ValueError):
-        raise InputError("device", "a device that is there, such as cpu", repr(device)) from None
+        count = torch.cuda.device_count()
+        of_cuda = f"cuda:0{f' to cuda:{count - 1}' if count > 1 else ''}, {count} in all" if count else "no CUDA device"
+        raise InputError("device", f"a device that is there, such as cpu ({of_cuda})", str(device)) from None
 
 
 def computing_on(device: torch.device) -> AbstractContextManager[None]:

@@ -34,7 +34,7 @@ from torchgco.compiled.numbers import (
 )
 from torchgco.constraints.link import Integral
 from torchgco.explaining.explain import Account
-from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, served_by
+from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, is_mixed, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
@@ -55,9 +55,7 @@ CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEA
 @contextmanager
 def _plainly() -> Iterator[None]:
     """Tensors that are kept lie on the CPU and can be written in place, whatever the caller's default and mode are.
-
-    A warm call makes none, and does without: this takes as long as a part of the solve.
-    """
+    A warm call makes none, and does without: this takes as long as a part of the solve."""
     with torch.inference_mode(False), computing_on(CPU):
         yield
 
@@ -108,6 +106,7 @@ class Compiled:
 
     Attributes:
         numbers: what a call may change: names, shapes and values, also to be read and written by name.
+        origin: the device of the problem, and whether its functions hold tensors of another one than the CPU.
     """
 
     numbers: Numbers
@@ -124,9 +123,10 @@ class Compiled:
             raise InputError("receding", "False where the time is free: calls say what has `elapsed`, s", True)
         if any(isinstance(part, Integral) for part in problem.constraints):
             raise InputError("problem", "one without Integral in compiled problems and loops", "Integral")
-        self._device, there = problem.x0.device, held_on_cpu(problem)
-        self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
         self._given: Problem | None = problem
+        there = held_on_cpu(problem)
+        self.origin, self.solver, self.interior = (problem.x0.device, is_mixed(there)), solver, interior
+        self.receding, self.changes = receding, changes
         with _plainly():
             self._begin(with_own_numbers(there))
 
@@ -147,7 +147,7 @@ class Compiled:
         """Compile and pack a problem as it is now; what was packed before hands its iterates on."""
         self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
         before, self._kept = self._kept, None
-        with served_by(self._device):
+        with served_by(*self.origin):
             self._packed(problem)
         if self._kept is not None and before is not None:
             self._kept.begin_with(before)
@@ -291,7 +291,7 @@ class Compiled:
     @_plainly()
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
-        names = "solver", "interior", "receding", "changes", "_device"
+        names = "solver", "interior", "receding", "changes", "origin"
         return {"problem": self.now} | {name: getattr(self, name) for name in names}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -426,7 +426,7 @@ class Compiled:
         solver = self.interior if self.solver == "interior_point" else named("gco", now)
         seconds = None if until == math.inf else max(1e-3, until - clock.seconds())
         warm = None if shift is None or self._last is None else later(now, self._last, shift)
-        with served_by(self._device):
+        with served_by(*self.origin):
             return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:

@@ -22,7 +22,7 @@ from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbers import Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, stage_of
 from torchgco.guidance.mppi import MPPI
-from torchgco.kernels import current, held_on_cpu, open_loop, path_clearance, served_by
+from torchgco.kernels import current, held_on_cpu, is_mixed, open_loop, path_clearance, served_by
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.problem.alone import check_rows
 from torchgco.problem.in_time import at_times
@@ -320,7 +320,8 @@ class MPPIController:
     ) -> None:
         check_untransformed("MPPIController")
         problem = current_problem(problem)
-        self._device, problem = problem.x0.device, held_on_cpu(problem)
+        device, problem = problem.x0.device, held_on_cpu(problem)
+        self._origin = device, is_mixed(problem)  # as `Compiled.origin`
         self.sampler = check_value(sampler or MPPI(), MPPI, "sampler")
         self.sampler.check(problem)
         self.seed, self.period = check_value(seed, Seed, "seed"), check_value(period, Seconds | None, "period")
@@ -368,7 +369,7 @@ class MPPIController:
         self.numbers.write(self._motion.numbers(self._problem, t, values))
         self._motion.keep(self._problem, t)
         self._t = t
-        with torch.no_grad(), torch.inference_mode(False), computing_on(CPU), served_by(self._device):
+        with torch.no_grad(), torch.inference_mode(False), computing_on(CPU), served_by(*self._origin):
             before = shifted(self.U, self._stages) if shift and self._commands else self.U
             key = DrawKey(self.seed, self._ids, torch.full_like(self._ids, self._commands))
             now = current(with_numbers_as_they_are(self._problem))
@@ -377,5 +378,5 @@ class MPPIController:
                 check_rows(now, open_loop(now, improved), improved)
             self.U = improved
         self._commands += 1
-        u = self.U[:, 0].clone().to(self._device)
+        u = self.U[:, 0].clone().to(self._origin[0])
         return u[0] if state.ndim == 1 and B == 1 else u

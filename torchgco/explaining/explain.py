@@ -106,7 +106,7 @@ class Account(PerElement):
         name: of the preset that the user named; None: the solver's class.
         rows: the problems (b,) of the account; None: all.
         t: times, where the problem isn't there.
-        kernels: that solved: "native", "pytorch", or another library's name; None where that isn't known.
+        kernels: that solved: "native", "cuda", "pytorch", or another library's name; None where that isn't known.
         smoothing: of the solution, in units of the cost.
     """
 

@@ -17,7 +17,7 @@ from torchgco.constraints.norms import within_norms
 from torchgco.export.files import Build, Exported, write_files
 from torchgco.export.numbers import changing
 from torchgco.export.source import solver_source
-from torchgco.kernels import current, interior_of
+from torchgco.kernels import current, interior_of, served_by
 from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.problem import Problem
@@ -51,7 +51,7 @@ def export_c(
     are where its numbers say that they are now.
 
     Args:
-        problem: one vehicle, or a compiled problem with one.
+        problem: one vehicle, or a compiled problem with one. Numbers of a GPU are copied.
         folder: is made if it isn't there; files of these names are overwritten.
         name: of files, types and functions: a word of C.
         receding: each step's horizon begins a stage after that of the step before; the example and the test move so.
@@ -79,7 +79,7 @@ def export_c(
         raise InputError("name", "a word of C, such as controller", shown(name))
     if isinstance(problem, Compiled):
         changes = problem.changes if changes is None else changes
-        compiled = compile(problem.now, "interior_point", tolerance=problem.interior.tolerance)
+        compiled = _compiled_again(problem)
     else:
         compiled = compile(_checked(problem), "interior_point")
     kept = _served(compiled)
@@ -97,6 +97,12 @@ def export_c(
     return write_files(exported, Path(folder), build)
 
 
+def _compiled_again(problem: Compiled) -> Compiled:
+    """The problem as it is now, for the interior point."""
+    with served_by(*problem.origin):
+        return compile(problem.now, "interior_point", tolerance=problem.interior.tolerance)
+
+
 def _checked(problem: Problem) -> Problem:
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem, or what torchgco.compile makes of one", type(problem).__name__)
@@ -104,8 +110,6 @@ def _checked(problem: Problem) -> Problem:
         raise InputError("problem", "one vehicle: export problem.take([b]) of each", f"{problem.B} problems")
     if problem.x0.dtype != torch.float64:
         raise InputError("problem.x0", "double precision", str(problem.x0.dtype))
-    if problem.x0.device.type != "cpu":
-        raise InputError("problem", "one on the CPU", str(problem.x0.device))
     for field, found in (("time", problem.time), ("free_start", problem.free_start), ("horizon", problem.horizon)):
         if found is not None:
             raise InputError(f"problem.{field}", "None in exported C", type(found).__name__)

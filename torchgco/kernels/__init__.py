@@ -7,10 +7,13 @@ problems of a GPU to the CPU, and has their loops run on the GPU. It imports `na
 """
 
 from torchgco.kernels.choice import EagerWarning as EagerWarning
+from torchgco.kernels.choice import at_once as at_once
 from torchgco.kernels.choice import copied_to as copied_to
 from torchgco.kernels.choice import current as current
+from torchgco.kernels.choice import current_device as current_device
 from torchgco.kernels.choice import expect_interior as expect_interior
 from torchgco.kernels.choice import held_on_cpu as held_on_cpu
+from torchgco.kernels.choice import is_mixed as is_mixed
 from torchgco.kernels.choice import kernels_of as kernels_of
 from torchgco.kernels.choice import native as native
 from torchgco.kernels.choice import on_cpu as on_cpu

@@ -19,12 +19,15 @@ from torchgco.base.errors import DeviceWarning, InputError
 from torchgco.base.gradients import is_forward, nodes
 from torchgco.base.memory import trim
 from torchgco.base.shapes import CPU, computing_on
+from torchgco.base.together import Together
 from torchgco.base.tree import PerElement, field_names, is_users, mapped
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.cuda.compiler import Loaded, available
-from torchgco.native.cuda.engine import OnDevice, working_on
+from torchgco.native.cuda.engine import OnDevice, has_served, working_on
+from torchgco.native.cuda.engine import at_once as at_once
+from torchgco.native.cuda.engine import current_device as current_device
 from torchgco.native.engine import Engine
 from torchgco.native.identity import signature
 from torchgco.native.interior import begin_interior
@@ -33,6 +36,7 @@ from torchgco.problem.problem import Problem
 from torchgco.tracing import CAPTURED, Facts
 
 ENGINES_KEPT = 64  # engines, the most recent ones
+ON_DEVICE = "cuda"  # kernels of which some have run on a GPU
 CURRENT, OWN = "current", "own tensors"  # what a problem keeps of its solves: see `current`
 
 
@@ -174,8 +178,10 @@ def _warn(warned: set[str], error: Exception) -> None:
 
 
 def used(problem: Problem) -> str:
-    """The name of the kernels that have worked on problems of this form."""
-    return NativeKernels.name if problem.known.in_c and native() else Kernels.name
+    """The name of the kernels that have worked on problems of this form: `ON_DEVICE` if a GPU has served them, too."""
+    if not problem.known.in_c or not native():
+        return Kernels.name
+    return ON_DEVICE if has_served() else NativeKernels.name
 
 
 def expect_interior(problem: Problem) -> None:
@@ -215,13 +221,13 @@ def on_cpu(problem: Problem) -> Problem | None:
     """The problem on the CPU in float64, where it lies on another device and C serves it on the CPU; else None.
 
     A DeviceWarning says so once in a process. A problem stays where the process has chosen PyTorch's kernels
-    (`use_native`), and where code can't be traced on the CPU, as that of a function which holds a tensor of its device.
+    (`use_native`), and where code can't be traced on the CPU. What functions hold on its device is read from there.
     """
     device = problem.x0.device
     if device.type == CPU.type or problem.B == 0 or not native():
         return None
     there = _copied(problem)
-    with computing_on(CPU), served_by(device):
+    with computing_on(CPU), served_by(device, False):
         if not serves(there):
             return None
     global _said
@@ -250,16 +256,25 @@ def on_device(device: torch.device) -> OnDevice | None:
     return OnDevice(partial(Loaded, device=device)) if device.type == "cuda" and available() else None
 
 
+def is_mixed(problem: Problem) -> bool:
+    """Whether functions of a problem on the CPU, which C serves, hold tensors of another device."""
+    return bool(problem.known.in_c) and problem.known.in_c.engine.captured.is_elsewhere
+
+
 @contextmanager
-def served_by(device: torch.device) -> Iterator[None]:
-    """In this block what iterates on many problems runs on a device, if that has kernels."""
+def served_by(device: torch.device, mixed: bool) -> Iterator[None]:
+    """In this block what iterates on many problems runs on a device, if that has kernels.
+
+    Args:
+        mixed: of the problem on the CPU, see `is_mixed`.
+    """
     kernels = on_device(device) if native() else None
-    with nullcontext() if kernels is None else working_on(kernels):
+    with Together(CPU) if mixed else nullcontext(), nullcontext() if kernels is None else working_on(kernels):
         yield
 
 
 def _copied(problem: Problem) -> Problem:
-    """The problem without gradients; what users' functions hold stays where it is."""
+    """The problem without gradients; what users' functions hold stays where it is, see `base.together`."""
     change = lambda leaf: leaf.detach().to(CPU, torch.float64 if leaf.is_floating_point() else leaf.dtype)
     parts = {name: mapped(getattr(problem, name), change) for name in field_names(type(problem))}
     return problem._with(parts)

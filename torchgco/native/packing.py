@@ -67,6 +67,11 @@ class Captured:
         return any(traced.reads_own for traced in self.traces)
 
     @property
+    def is_elsewhere(self) -> bool:
+        """Whether some lie on another device."""
+        return any(tensor.device.type != "cpu" for tensor in self._outside)
+
+    @property
     def nbytes(self) -> int:
         """The size of all these tensors, of sparse ones as if they were dense."""
         return sum(tensor.numel() * tensor.element_size() for tensor in self._outside)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.options import Count, Positive, check_options
 from torchgco.base.tree import LastTaken, put, take
 from torchgco.ilqr.line_search import LineSearch
-from torchgco.kernels import chord_clearance, measured, value
+from torchgco.kernels import at_once, chord_clearance, measured, value
 from torchgco.lagrangian.lagrangian import Lagrangian, Multipliers
 from torchgco.lagrangian.penalties import Penalty
 from torchgco.obstacles.base import ADMITTED
@@ -138,11 +138,11 @@ class Candidates:
         return Lagrangian(problem, Multipliers.none(problem, penalty * self.unit[rows]), attraction, True)
 
     def parts(self) -> Iterator[Tensor]:
-        """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time."""
-        rows = self.live.nonzero().flatten()
-        if rows.numel() <= CANDIDATES_AT_ONCE:
+        """Rows of the live candidates, `CANDIDATES_AT_ONCE` at a time on the CPU."""
+        rows, most = self.live.nonzero().flatten(), at_once(CANDIDATES_AT_ONCE)
+        if rows.numel() <= most:
             return iter((rows,) if rows.numel() > 0 else ())
-        return iter(rows.split(CANDIDATES_AT_ONCE))
+        return iter(rows.split(most))
 
     def arrive(self) -> Tensor:
         """Whether each candidate ends near the goal, (B * count,)."""

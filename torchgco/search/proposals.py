@@ -11,8 +11,11 @@ removing it would use up a whole attempt, or must first be refined.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import torch
@@ -20,8 +23,9 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Natural, Positive
+from torchgco.base.shapes import computing_on
 from torchgco.base.tree import put, take
-from torchgco.kernels import cost_unit, open_loop, value
+from torchgco.kernels import cost_unit, current_device, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
@@ -288,6 +292,7 @@ class Part:
         self.paths: Paths | None = None
         self.proposal = Proposal.none(problem, rest)
         self._free: Free | None = None
+        self._ahead: Future[Paths] | None = None  # of all problems, from another thread
 
     @cached_property
     def scales(self) -> tuple[Tensor, Tensor]:
@@ -295,8 +300,23 @@ class Part:
         assert self.scene is not None
         return seen.scales(self.problem, self.scene, self.rest)
 
+    def seek_ahead(self, helper: Executor, roadmaps: Sequence[Roadmap], count: int) -> None:
+        """Begin to seek, in a helper's thread, what `seek` will be asked for, of all problems."""
+        if self.scene is not None and self.scene.gates is None:
+            every = torch.arange(self.problem.B, device=self.rest.device)
+            self._ahead = helper.submit(copy_context().run, self._sought, every, roadmaps, count)
+
     def seek(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
         """The paths of some searches, `count` each and one per homotopy class, of the problems in `rows`."""
+        ahead, self._ahead = self._ahead, None
+        return self._sought(rows, roadmaps, count) if ahead is None else ahead.result()
+
+    def _sought(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
+        """`seek`."""
+        with computing_on(self.rest.device):
+            return self._sought_here(rows, roadmaps, count)
+
+    def _sought_here(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
         assert self.scene is not None
         R, unit = (scale[rows] for scale in self.scales)
         usable, known = torch.isfinite(unit) & (unit > 0), []
@@ -362,8 +382,17 @@ class Round:
         self.parts = [Part(scaled.take(rows), self.rest[rows], places[rows], record) for rows in self.rows]
 
     def improve(self, proposals: PathProposals) -> Tensor:
-        """One more pass; returns the problems (b,) that it looked at."""
-        worked = [rows[proposals.improve(part, self.watch)] for rows, part in zip(self.rows, self.parts, strict=True)]
+        """One more pass; returns the problems (b,) that it looked at.
+
+        Where a device solves candidates, a thread of the CPU seeks the next part's paths meanwhile.
+        """
+        together = not proposals.continues and proposals.at_once >= len(self.rows[0])  # all of a part
+        seeks, worked = bool(proposals.roadmaps) and together and current_device() is not None, []
+        with ThreadPoolExecutor(1) as helper:
+            for rows, part, after in zip_longest(self.rows, self.parts, self.parts[1:]):
+                if seeks and after is not None:
+                    after.seek_ahead(helper, proposals.roadmaps, proposals.num_paths)
+                worked.append(rows[proposals.improve(part, self.watch)])
         return torch.cat(worked)
 
     def result(self) -> Proposal:

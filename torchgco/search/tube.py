@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchgco.base.options import Count
 from torchgco.base.status import STOPPED
-from torchgco.kernels import open_loop
+from torchgco.kernels import at_once, open_loop
 from torchgco.maps.ways import length
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.cheapest import HOPS
@@ -247,7 +247,7 @@ class Tube(Row):
         if rows.numel() == 0:
             return
         each = (1 + self.num_paths) * (1 + 2 * search.call.problem.m) * PACES
-        for some in rows.split(max(1, TRACKED_AT_ONCE // each)):
+        for some in rows.split(max(1, at_once(TRACKED_AT_ONCE) // each)):
             if search.call.late:
                 return
             self._some(search, some)

@@ -21,7 +21,7 @@ from torchgco.base.shapes import check_shape, check_tensor, check_untransformed,
 from torchgco.base.status import Status
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.explain import Account
-from torchgco.kernels import copied_to, cost_unit, current, interior_of, kernels_of, on_cpu, served_by, used
+from torchgco.kernels import copied_to, cost_unit, current, interior_of, is_mixed, kernels_of, on_cpu, served_by, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
@@ -205,7 +205,7 @@ class Solver(Brief, Checked):
         problem, limit = current_problem(problem), check_value(max_seconds, Seconds | None, "max_seconds")
         if self.kernels is None and (there := on_cpu(problem)) is not None:
             U0, ids, warm, X0 = copied_to((U0, ids, warm, X0), there.x0)
-            with served_by(problem.x0.device):
+            with served_by(problem.x0.device, is_mixed(there)):
                 solution = self.solve(there, U0, seed, ids, warm, callback, max_seconds, X0)
             account = solution.account and solution.account.asked(problem, None)
             return replace(copied_to(solution, problem.x0), account=account)
@@ -318,8 +318,9 @@ class Solver(Brief, Checked):
     def prepare(self, problem: Problem) -> Solver:
         """The solver with everything built that this batch needs, so that nothing is compiled beside the solve."""
         problem = current_problem(problem)
-        whole = for_solvers(on_cpu(problem) or problem, self.joins_knots)
-        with computing_on(whole.x0.device), served_by(problem.x0.device):
+        there = on_cpu(problem) or problem
+        whole = for_solvers(there, self.joins_knots)
+        with computing_on(whole.x0.device), served_by(problem.x0.device, is_mixed(there)):
             self.announce(whole)
             if whole.B > 0 and kernels_of(whole) and whole.known.expects_interior:
                 interior_of(whole)

@@ -12,7 +12,16 @@ from torchgco.base.status import SOLVED, STALLED, UNMOVED, Status, is_over
 from torchgco.base.tree import put, take
 from torchgco.constraints.bounds import Bounds, bounds_of
 from torchgco.ilqr.riccati import backward
-from torchgco.kernels import cost_scale, cost_unit, expect_interior, interior_of, measured, open_loop, rolled_out
+from torchgco.kernels import (
+    at_once,
+    cost_scale,
+    cost_unit,
+    expect_interior,
+    interior_of,
+    measured,
+    open_loop,
+    rolled_out,
+)
 from torchgco.lagrangian.barrier import GOLDEN, BarrierOptions, least_violation
 from torchgco.lagrangian.lagrangian import Iterate, Lagrangian, Multipliers, SolveEnd, linearise
 from torchgco.lagrangian.quality import is_better
@@ -231,7 +240,7 @@ class InteriorPoint(Solver, named="solver"):
         end.status[:] = status
         rows = (status == Status.RUNNING).nonzero().flatten()
         begun, falls = torch.zeros_like(status, dtype=torch.bool), torch.zeros_like(status, dtype=torch.bool)
-        for chunk in rows.split(REPORTED_AT_ONCE):
+        for chunk in rows.split(at_once(REPORTED_AT_ONCE)):
             if call.late:
                 end.status[chunk] = Status.TIME_LIMIT
                 continue

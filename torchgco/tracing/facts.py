@@ -27,6 +27,7 @@ from torch.nn.utils import parametrize
 from torch.utils._device import DeviceContext
 from torch.utils._python_dispatch import _get_current_dispatch_mode_stack
 
+from torchgco.base.together import Together
 from torchgco.base.tree import PerElement
 from torchgco.tracing.trust import (
     BY_NAME,
@@ -376,7 +377,8 @@ def _bytes(tensor: Tensor) -> bytes:
 def _surroundings() -> tuple[Hashable, ...]:
     """What operations of PyTorch depend on besides their arguments."""
     modes = map(torch._C._get_function_stack_at, range(torch._C._len_torch_function_stack()))
-    if _get_current_dispatch_mode_stack() or any(type(mode) is not DeviceContext for mode in modes):
+    others = any(type(mode) is not Together for mode in _get_current_dispatch_mode_stack())
+    if others or any(type(mode) is not DeviceContext for mode in modes):
         raise Unseen("a mode of PyTorch")
     if _has_any_global_hook() or parametrize._cache_enabled:
         raise Unseen("hooks of all modules, or parametrizations that are kept")

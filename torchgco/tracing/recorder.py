@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import count, groupby
@@ -17,8 +17,10 @@ from torchgco.base.autodiff import WithoutReading
 from torchgco.base.errors import InputError, theirs
 from torchgco.base.roots import roots_as_operations
 from torchgco.base.shapes import MISTAKES
+from torchgco.base.together import copy_to, leaves, mapped_arguments, together
 from torchgco.tracing.decompositions import DECOMPOSITIONS
 from torchgco.tracing.operations import OPERATIONS
+from torchgco.tracing.watch import has_own_memory, overlap
 
 OF_SHAPES = "aten.is_same_size", "aten._has_same_storage_numel"  # operations that look at shapes alone
 READ_NUMBERS = 64  # numbers of a tensor, made by Python code, that are compared
@@ -46,11 +48,11 @@ class Operation:
 
     @cached_property
     def inputs(self) -> list[Slot]:
-        return [leaf for leaf in _leaves((self.args, self.kwargs)) if isinstance(leaf, Slot)]
+        return [leaf for leaf in leaves((self.args, self.kwargs)) if isinstance(leaf, Slot)]
 
     @cached_property
     def outputs(self) -> list[Slot]:
-        return [leaf for leaf in _leaves(self.result) if isinstance(leaf, Slot)]
+        return [leaf for leaf in leaves(self.result) if isinstance(leaf, Slot)]
 
     @property
     def title(self) -> str:
@@ -58,7 +60,7 @@ class Operation:
 
     def filled(self, known: dict[Slot, Any]) -> tuple[tuple, dict[str, Any]]:
         """The arguments with known values in the place of slots."""
-        return _mapped(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
+        return mapped_arguments(lambda leaf: known[leaf] if isinstance(leaf, Slot) else leaf, (self.args, self.kwargs))
 
     def replay(self, known: dict[Slot, Any]) -> None:
         """Apply PyTorch's operation to known tensors, and add its result to `known`."""
@@ -85,6 +87,7 @@ class Recording(TorchDispatchMode):
         self.read: list[Slot] = []  # what it reads of them, where that is a tensor
         self._made: set[Slot] = set()  # captured tensors that the function itself makes of Python's numbers
         self._outer: set[Slot] = set()  # what depends on the others
+        self._brought: dict[Slot, Tensor] = {}  # copies of captured tensors that lie on another device than the inputs
         self.examples = list(inputs)
         self.inputs = [self._new(tensor) for tensor in self.examples]
         self._followers = set(self.inputs)
@@ -117,7 +120,7 @@ class Recording(TorchDispatchMode):
         return False  # True would load PyTorch's compiler, which takes seconds, only to exclude this mode from it
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        kwargs = kwargs or {}
+        args, kwargs = together(func, args, kwargs or {}, self.examples[0].device, self._copy)
         if torch.Tag.nondeterministic_seeded in func.tags and not self.lenient:
             raise self._unfit("one that draws at random", func)
         if torch.Tag.inplace_view in func.tags and (out_of_place := _out_of_place(func)) and self._is_own(args[0]):
@@ -139,14 +142,16 @@ class Recording(TorchDispatchMode):
             self.look(*_shaping(func, args), kwargs)
         if (parts := self._decomposed(func, args, kwargs)) is not NotImplemented:
             return parts
-        if name_of(func) == "aten.lift_fresh" and _has_own_memory(args[0]):
+        if name_of(func) == "aten.lift_fresh" and has_own_memory(args[0]):
             self._made.add(self.slot(args[0]))
-        inputs, options = _mapped(lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs))
+        inputs, options = mapped_arguments(
+            lambda leaf: self.slot(leaf) if isinstance(leaf, Tensor) else leaf, (args, kwargs)
+        )
         if not func._schema.returns:  # it raises where values don't suit it, which the function may catch
             self.operations.append(Operation(func, inputs, options, (), self._calls.called, torch.get_default_dtype()))
             return func(*args, **kwargs)
         out = func(*args, **kwargs)
-        made = _mapped(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
+        made = mapped_arguments(lambda leaf: self._new(leaf) if isinstance(leaf, Tensor) else leaf, out)
         operation = Operation(func, inputs, options, made, self._calls.called, torch.get_default_dtype())
         self.operations.append(operation)
         if not self._followers.isdisjoint(operation.inputs):
@@ -173,6 +178,14 @@ class Recording(TorchDispatchMode):
                 parts = _decompositions()[func](*args, **kwargs)
         return parts
 
+    def _copy(self, tensor: Tensor, device: torch.device) -> Tensor:
+        """A captured tensor on the inputs' device, copied by an operation of the recording."""
+        slot = self.slot(tensor)
+        if slot not in self._brought:
+            with self:
+                self._brought[slot] = copy_to(tensor, device)
+        return self._brought[slot]
+
     def _is_own(self, tensor: Tensor) -> bool:
         """Whether a recorded operation has made a tensor."""
         slot = self.slot(tensor)
@@ -198,7 +211,7 @@ class Recording(TorchDispatchMode):
         if (after.shape, after.dtype) != (tensor.shape, tensor.dtype):
             raise self._unfit("one that writes in place where that can't be followed", func)
         func(*args, **kwargs)
-        self._stale |= {id(other) for _, other in self._seen.values() if _overlap(other, tensor)}
+        self._stale |= {id(other) for _, other in self._seen.values() if overlap(other, tensor)}
         self._stale.discard(id(tensor))
         self._seen[id(as_it_was)] = before, as_it_was
         self._seen[id(tensor)] = self.slot(after), tensor
@@ -211,38 +224,18 @@ class Recording(TorchDispatchMode):
 
     def _follows(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on the function's arguments."""
-        return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in _leaves(tree))
+        return any(isinstance(leaf, Tensor) and self.slot(leaf) in self._followers for leaf in leaves(tree))
 
     def look(self, *tree: Any) -> None:
         """Note that Python code reads values in `tree`, or sees a shape that depends on them."""
-        slots = [self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor) and self._is_outer(leaf)]
+        slots = [self.slot(leaf) for leaf in leaves(tree) if isinstance(leaf, Tensor) and self._is_outer(leaf)]
         self.looked |= bool(slots)
         self.read += slots
 
     def _is_outer(self, *tree: Any) -> bool:
         """Whether a tensor in `tree` depends on one from outside that isn't an argument."""
-        slots = (self.slot(leaf) for leaf in _leaves(tree) if isinstance(leaf, Tensor))
+        slots = (self.slot(leaf) for leaf in leaves(tree) if isinstance(leaf, Tensor))
         return any(slot in self._outer or (slot in self.captured and slot not in self._made) for slot in slots)
-
-
-def _has_own_memory(tensor: Tensor) -> bool:
-    """Whether a new tensor was made of numbers: the memory of a NumPy array, which it may share, can't be resized."""
-    with torch._C.DisableTorchFunction():
-        return tensor.untyped_storage().resizable()
-
-
-def _overlap(a: Tensor, b: Tensor) -> bool:
-    """Whether two tensors may share memory."""
-    (first, last), (begin, end) = _memory(a), _memory(b)
-    return first < end and begin < last
-
-
-def _memory(tensor: Tensor) -> tuple[int, int]:
-    """Where a tensor's memory begins and ends."""
-    if tensor.layout is not torch.strided or tensor.numel() == 0:
-        return 0, 0
-    steps = ((size - 1) * by for size, by in zip(tensor.shape, tensor.stride(), strict=True))
-    return tensor.data_ptr(), tensor.data_ptr() + (sum(steps) + 1) * tensor.element_size()
 
 
 class _Unfit(RuntimeError):
@@ -286,8 +279,8 @@ class _Reading(TorchDispatchMode):
             self.values.append(tuple(out.shape) if isinstance(out, Tensor) else None)
         kinds = {argument.name: str(argument.type) for argument in func._schema.arguments}
         typed = [*zip(kinds.values(), args, strict=False), *((kinds[name], value) for name, value in kwargs.items())]
-        self.path.append((str(func), *(self._number(kind, leaf) for kind, value in typed for leaf in _leaves(value))))
-        self._known |= {id(leaf): leaf for leaf in _leaves(out)}
+        self.path.append((str(func), *(self._number(kind, leaf) for kind, value in typed for leaf in leaves(value))))
+        self._known |= {id(leaf): leaf for leaf in leaves(out)}
         return out
 
     def _number(self, kind: str, leaf: Any) -> Any:
@@ -386,28 +379,6 @@ def title(operation: Any, called: Any) -> str:
     """What the user called, and the operation of PyTorch's that it came to."""
     name = None if called is None else resolve_name(called)
     return f"{name} ({operation})" if name else str(operation)
-
-
-def _mapped(function: Callable[[Any], Any], tree: Any) -> Any:
-    """The arguments of an operation, nested tuples, lists and dicts, with function(leaf) in the place of each leaf.
-
-    As PyTorch's `tree_map` of these three, which looks for many kinds more and takes half of the time of a trace.
-    """
-    if isinstance(tree, (tuple, list)):
-        mapped = [_mapped(function, branch) for branch in tree]
-        return mapped if isinstance(tree, list) else tuple(mapped)
-    if isinstance(tree, dict):
-        return {name: _mapped(function, branch) for name, branch in tree.items()}
-    return function(tree)
-
-
-def _leaves(tree: Any) -> Iterator[Any]:
-    """The leaves of what `_mapped` takes, in order."""
-    if isinstance(tree, (tuple, list, dict)):
-        for branch in tree.values() if isinstance(tree, dict) else tree:
-            yield from _leaves(branch)
-    else:
-        yield tree
 
 
 @cache

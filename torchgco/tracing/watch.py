@@ -27,3 +27,23 @@ def contents(tensors: Iterable[Tensor]) -> tuple[Hashable, ...] | None:
                 size = (sum(steps) + 1) * tensor.element_size()
         seen += address, tensor.shape, tensor.dtype, ctypes.string_at(address, size)
     return tuple(seen)
+
+
+def has_own_memory(tensor: Tensor) -> bool:
+    """Whether a new tensor was made of numbers: the memory of a NumPy array, which it may share, can't be resized."""
+    with torch._C.DisableTorchFunction():
+        return tensor.untyped_storage().resizable()
+
+
+def overlap(a: Tensor, b: Tensor) -> bool:
+    """Whether two tensors may share memory."""
+    (first, last), (begin, end) = _memory(a), _memory(b)
+    return first < end and begin < last
+
+
+def _memory(tensor: Tensor) -> tuple[int, int]:
+    """Where a tensor's memory begins and ends."""
+    if tensor.layout is not torch.strided or tensor.numel() == 0:
+        return 0, 0
+    steps = ((size - 1) * by for size, by in zip(tensor.shape, tensor.stride(), strict=True))
+    return tensor.data_ptr(), tensor.data_ptr() + (sum(steps) + 1) * tensor.element_size()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -19,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchgco.base.errors import InputError
 from torchgco.base.memory import free_memory
 from torchgco.base.options import Checked, Count, Within, check_value
+from torchgco.base.shapes import check_device
 from torchgco.dynamics import QuadrotorPlanning, QuadrotorThrusts
 from torchgco.experiments.config.checks import as_input_error, check, hydra_words
 from torchgco.experiments.config.groups import ANY_CLASS, ENTRY, classes_of, config_dir, register, scenarios_for
@@ -110,10 +112,16 @@ class Setup:
     solver: Any
     solver_name: str
     seed: int
-    device: torch.device
+    devices: tuple[torch.device, ...]  # that share a study's layouts, in turn
     dtype: torch.dtype
     mission: Mission | None = None  # with the solver under study as its planner's
     metrics: Mapping[str, Callable[..., Any]] = field(default_factory=dict)  # of the user, see `study.metrics`
+    turn: int = 0  # of the process that works, among those that share the devices
+
+    @property
+    def device(self) -> torch.device:
+        """That this process works on."""
+        return self.devices[self.turn % len(self.devices)]
 
     def layouts(self, count: int | None = None) -> Layouts:
         """Layouts 0..count-1 under the seed; by default all of a file, or 64.
@@ -154,7 +162,7 @@ class Setup:
         return fleet_of(self.vehicle, layouts or self.layouts())
 
     def task(self, layouts: Layouts | None = None) -> Task:
-        """The planning problems of some layouts (default: `layouts()`) on the configured device."""
+        """The planning problems of some layouts (default: `layouts()`) on this process's device."""
         return self.vehicle.task(layouts or self.layouts(), self.device, self.dtype)
 
 
@@ -232,7 +240,7 @@ def build(configuration: dict[str, Any]) -> Setup:
         of_map = str(scenario.get("_target_")).endswith("MapFile")
         wanted = "the map: add scenario.path=FILE" if of_map else "the layout file: add scenario.path=FILE.npz"
         raise InputError("scenario.path", wanted, "none")
-    device, dtype = _device(configuration["device"])
+    devices, dtype = _devices(configuration["device"])
     setup = Setup(
         configuration=configuration,
         vehicle=_vehicle(configuration),
@@ -240,7 +248,7 @@ def build(configuration: dict[str, Any]) -> Setup:
         solver=solver_of(configuration),
         solver_name=configuration["solver"]["name"],
         seed=configuration["seed"],
-        device=device,
+        devices=devices,
         dtype=dtype,
         metrics=metrics_of(configuration),
     )
@@ -378,17 +386,20 @@ def _instantiate(node: Any, field: str) -> Any:
 class _Device(Checked, named="device"):
     """The node `device`."""
 
-    name: Literal["cpu", "cuda"]
+    name: str
     dtype: Literal["float64", "float32"]
     kernels: Literal["native", "eager"]
     threads: Annotated[int, Within(1, MAX_PROCESSES)] | None
 
 
-def _device(node: Mapping[str, Any]) -> tuple[torch.device, torch.dtype]:
-    """The device and dtype; also sets the threads and kernels of this process."""
+def _devices(node: Mapping[str, Any]) -> tuple[tuple[torch.device, ...], torch.dtype]:
+    """The devices and dtype; also sets the threads and kernels of this process."""
     device = _Device(**{field.name: node[field.name] for field in fields(_Device)})
-    if device.name == "cuda" and not torch.cuda.is_available():
-        raise InputError("device", "device=cpu, as no CUDA device is visible", "device=cuda")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device.name):
+        raise InputError("device.name", "cpu, cuda, or one of several such as cuda:1", device.name)
+    check_device(device.name)
     torch.set_num_threads(allotted_cores() if device.threads is None else device.threads)
     use_native(device.kernels == "native")
-    return torch.device(device.name), getattr(torch, device.dtype)
+    every = range(torch.cuda.device_count()) if device.name == "cuda" else ()
+    devices = tuple(torch.device("cuda", number) for number in every) or (torch.device(device.name),)
+    return devices, getattr(torch, device.dtype)

@@ -25,13 +25,21 @@ PATH_KEYS = ("scenario.path", "hydra.run.dir", "hydra.sweep.dir")  # keys whose 
 
 
 def hydra_words(words: Iterable[str]) -> list[str]:
-    """The words of a command line as Hydra takes them: `~mission` for `mission=null`, paths without `~` and quoted.
+    """The words of a command line as Hydra takes them: `~mission` for `mission=null`, paths without `~` and quoted, the
+    number of a device as that of its name.
 
     Raises:
         InputError: a value that is no name, where the word chooses an option of a group, or a row of a list to delete:
             Hydra fails there.
     """
-    return [_hydra_word(word) for word in words]
+    return [part for word in words for part in _of_numbered(_hydra_word(word))]
+
+
+def _of_numbered(word: str) -> list[str]:
+    """A word for a device, or a sweep over some, with the number of each, such as `device=cuda:1`, as two words: Hydra
+    has a file for its kind alone."""
+    numbered = re.fullmatch(r"device=((?:cuda:\d+,?)+)", word.replace("\\:", ":"))  # as a sweep writes its jobs' words
+    return [word] if numbered is None else ["device=cuda", f"device.name={numbered[1]}"]
 
 
 def _hydra_word(word: str) -> str:

@@ -140,7 +140,7 @@ COUNTED = ["status", "feasible", "reached"]
 MEANING = {
     "scenario": "family, or file", "seed": "of layouts and draws", "model": "see the configuration",
     "solver": "likewise", "device": "that computed", "dtype": "of the solve; numbers here are double",
-    "version": "of torchgco", "kernels": "native: C", "gates_passed": "in their order",
+    "version": "of torchgco", "kernels": "native: C; cuda: C on a GPU, too", "gates_passed": "in their order",
     "violation_between": "within stages, of rows kept at knots alone", "box_amplitudes": "m, of sines",
     "box_rates": "rad/s", "box_phases": "rad", "goal_required": "whether the goal is a constraint",
     "map_origin": "m", "map_resolution": "m, a cell", "map_unknown": "what unknown cells count as",

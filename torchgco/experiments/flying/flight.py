@@ -149,8 +149,9 @@ def plan_of(setup: Setup) -> Schedule:
     if plan.workers is not None:
         return plan
     # On a GPU the batches of several processes would share one device.
-    cores = torch.get_num_threads() if setup.device.type == "cuda" else allotted_cores()
-    return replace(plan, workers=max(1, cores // torch.get_num_threads()))
+    on_cpu = setup.device.type == "cpu"
+    workers = allotted_cores() // torch.get_num_threads() if on_cpu else len(setup.devices)
+    return replace(plan, workers=max(1, workers))
 
 
 def check_time(task: Task, solvers: Mapping[str, Any]) -> None:
@@ -296,7 +297,7 @@ class SolveBatch(Batch):
         solver, at_once = self.solver.prepare(problem), problem.B
         if solver.in_slots(1) is not None:
             plan = plan_of(self.setup)
-            processes = (plan.workers or 1) * jobs_at_once()
+            processes = -(-(plan.workers or 1) // len(self.setup.devices)) * jobs_at_once()  # of one device
             batch_size = None if plan.batch_size == "auto" else plan.batch_size
             at_once = min(problem.B, batch_size or plan_batch(problem, self.setup.device, processes))
             solver = solver.in_slots(at_once)
@@ -341,14 +342,20 @@ def _now(device: torch.device) -> float:
 # Functions of worker processes. They are here, not in `study`, so that no worker loads the report's figures.
 
 
-def prepare(threads: int, in_c: bool) -> None:
-    """Give a worker process the threads and kernels of the study's own."""
+_turn = 0  # of this process among the workers
+
+
+def prepare(turn: int, threads: int, in_c: bool) -> None:
+    """Give a worker process the threads and kernels of the study's own, and its turn among the devices."""
+    global _turn
+    _turn = turn
     torch.set_num_threads(threads)
     use_native(in_c)
 
 
 def fly(flight: Batch) -> Flown:
     """The flight's rows and controls, under its solver's name."""
+    flight.tasks.setup = replace(flight.setup, turn=_turn)
     return flight.name, flight.fly()
 
 

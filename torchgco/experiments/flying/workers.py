@@ -47,7 +47,7 @@ def run_all(
     most NEW_POOLS times. An interruption or an error of `work` or `keep` ends all processes.
 
     Args:
-        prepare, options: `prepare(*options)` runs first in every process.
+        prepare, options: `prepare(number, *options)` runs first in every process; the processes are numbered from 0.
         say: receives a line for each broken pool.
         watch: called every WORKERS_POLL seconds with the sum of what `Shared` bars counted in all jobs: trials.
 
@@ -83,7 +83,8 @@ def _run_pool(
 ) -> None:
     """Run the jobs that are left by one pool and remove those with a result; returns early where it broke."""
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, begin)
+    arguments: Any = *begin, CONTEXT.Value("i", 0)
+    pool = ProcessPoolExecutor(processes, CONTEXT, _begin_worker, arguments)
     try:
         with raised() as noted:
             with _interrupts_held(noted):
@@ -139,10 +140,13 @@ class Shared(NoBar):
             self.counts[self.job] += n
 
 
-def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts: Any) -> None:
+def _begin_worker(prepare: Callable[..., None], options: tuple[Any, ...], counts: Any, begun: Any) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     Shared.counts = counts
-    prepare(*options)
+    with begun.get_lock():
+        number = begun.value
+        begun.value += 1
+    prepare(number, *options)
 
 
 def _work(work: Callable[[Job], Result], job: Job, number: int) -> Result:

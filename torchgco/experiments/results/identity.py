@@ -52,12 +52,17 @@ def decisive(configuration: Mapping[str, Any], solvers: Mapping[str, Any]) -> di
     return {
         "scenario": configuration["scenario"],
         "model": {"vehicle": configuration["model"]["vehicle"]},
-        "device": {name: configuration["device"].get(name) for name in ARITHMETIC},
+        "device": {name: configuration["device"].get(name) for name in ARITHMETIC} | {"name": kind_of(configuration)},
         "study": {"solvers": list(solvers), **({"metrics": metrics} if metrics else {})},
         "solvers": dict(solvers),
         "order": {name: list(rows) for name, rows in passes.items() if isinstance(rows, Mapping)},
         **closed_loop(configuration),
     }
+
+
+def kind_of(configuration: Mapping[str, Any]) -> str:
+    """The kind of a configuration's device, "cpu" or "cuda": which of several it is decides no result."""
+    return str(configuration["device"].get("name")).partition(":")[0]
 
 
 def closed_loop(configuration: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,7 +108,7 @@ class Manifest:
         """Values that all rows of the study share, by column."""
         device, config = self.configuration["device"], self.configuration
         return {
-            "seed": config["seed"], "version": config["version"], "device": device["name"], "dtype": device["dtype"]
+            "seed": config["seed"], "version": config["version"], "device": kind_of(config), "dtype": device["dtype"]
         }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:

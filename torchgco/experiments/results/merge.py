@@ -212,7 +212,7 @@ def _value(settings: Mapping[str, Any], key: str) -> str:
 REPEATED = "repeated"  # in the attributes of a merged table: rows left out because another run has the same flight
 UNFINISHED = "unfinished"  # likewise: for each study that isn't finished, "96 of 128 trials in FOLDER"
 # Columns in which runs of one flight may differ: they depend on timing, batching and the other solvers that flew.
-INCIDENTAL = {"seconds", "batch_size", "threads", "best_cost", "best_from", "success"}
+INCIDENTAL = {"seconds", "batch_size", "threads", "kernels", "best_cost", "best_from", "success"}
 # Columns of numbers while runs are merged: of the run, the solver's variant, the layout.
 RUN, VARIANT, LAYOUT = "_run", "_variant", "_layout"
 OWN = [RUN, VARIANT]

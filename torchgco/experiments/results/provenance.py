@@ -8,6 +8,7 @@ Each file is a list with an entry per start, the oldest first. An entry is a dic
 - torchgco: version, and where the package is a git checkout its commit, and whether files differ from it
 - packages: versions of Python and of the libraries that compute
 - machine: platform, processor, number of cores, first line of the C compiler's version (null: none)
+- devices: that share the layouts, with the names of GPUs
 - threads, workers: per process, and processes
 - seed
 - job: [job, jobs] where the process flew a share, else null
@@ -31,6 +32,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -85,6 +87,7 @@ def _entry(setup: Setup, plan: Schedule, command: Sequence[str]) -> dict[str, An
             "platform": platform.platform(), "processor": _or_none(_processor), "cores": os.cpu_count(),
             "compiler": _or_none(_compiler),
         },
+        "devices": [_or_none(partial(_device, device)) for device in setup.devices],
         "threads": torch.get_num_threads(),
         "workers": plan.workers,
         "seed": setup.seed,
@@ -131,6 +134,10 @@ def _version(name: str) -> str | None:
 def _processor() -> str | None:
     lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), None)
+
+
+def _device(device: torch.device) -> str:
+    return f"{device}, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else str(device)
 
 
 def _compiler() -> str | None:

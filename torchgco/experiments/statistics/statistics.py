@@ -24,6 +24,7 @@ TASK = ["scenario", "model"]
 PAIR = [*TASK, "layout", "seed"]
 EFFORT = ["iterations", "outer_iterations", "guided", "seconds"]
 MAKESPAN = "makespan"  # of fleets
+MACHINERY = ("threads", "device", "kernels")  # columns that say on what a trial was solved
 NEEDED_COLUMNS = [*PAIR, "solver", "status", *OUTCOMES, PAPER_OUTCOME, "violation", "cost", *EFFORT]
 NUMBER_COLUMNS = [*EFFORT, "violation", "cost", "best_cost", "clearance", "clearance_knots", "goal_distance"]
 TEXTS = ("string", "categorical", "bytes")  # kinds of columns without numbers, as pandas calls them
@@ -93,6 +94,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
             if one of them lacks the number.
         makespan_median, _p90: of fleets that reached their goals.
         status_<NAME>: trials that ended with this status; missions: with this outcome.
+        threads, device, kernels: what they were solved on, as text.
 
     _p90 is the 90 % quantile, interpolated linearly.
 
@@ -111,7 +113,7 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
 class _Values:
     """The columns of a table as arrays of numbers."""
 
-    seed: np.ndarray
+    texts: dict[str, np.ndarray]
     invalid: np.ndarray
     hits: dict[str, np.ndarray]
     numbers: dict[str, np.ndarray]
@@ -128,7 +130,8 @@ class _Values:
         status, statuses = pd.factorize(trials["status"])
         hits = attained(trials, groups)
         invalid = (trials["status"] == INVALID).to_numpy(dtype=bool)
-        return cls(trials["seed"].to_numpy(), invalid, hits, numbers, status, [str(name) for name in statuses])
+        texts = {name: trials[name].to_numpy() for name in ("seed", *MACHINERY) if name in trials.columns}
+        return cls(texts, invalid, hits, numbers, status, [str(name) for name in statuses])
 
     def summary(self, rows: np.ndarray) -> dict[str, object]:
         selected = {name: values[rows] for name, values in self.numbers.items()}
@@ -136,7 +139,7 @@ class _Values:
         ratio = selected["cost_ratio"][reached & np.isfinite(selected["cost_ratio"])]
         row: dict[str, object] = {
             "n": len(rows),
-            "seed": " ".join(str(seed) for seed in pd.unique(self.seed[rows])),
+            "seed": self.text("seed", rows),
             "invalid": len(rows) - int(valid.sum()),
         }
         for name in self.hits:
@@ -154,7 +157,12 @@ class _Values:
         if MAKESPAN in selected:
             row |= _quantiles(MAKESPAN, selected[MAKESPAN][reached])
         counts = np.bincount(self.status[rows], minlength=len(self.statuses)).tolist()
-        return row | {f"{STATUS}{name}": count for name, count in zip(self.statuses, counts, strict=True)}
+        row |= {f"{STATUS}{name}": count for name, count in zip(self.statuses, counts, strict=True)}
+        return row | {name: self.text(name, rows) for name in MACHINERY if name in self.texts}
+
+    def text(self, name: str, rows: np.ndarray) -> str:
+        """The values of a column in some rows, each once."""
+        return " ".join(str(value) for value in pd.unique(self.texts[name][rows]))
 
 
 def attained(trials: pd.DataFrame, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

@@ -23,6 +23,9 @@ from torchgco.native.cuda.source import Program, source
 # Problems or samples, for each thread of the CPU that has some, from which on a device is asked. An estimate: 256
 # threads of an H200 are as fast as one core or two.
 LEAST = 512
+# Problems of one call at least: about as many as an H200 has threads at the same time, 132 multiprocessors with
+# `launch.BLOCKS` blocks each.
+AT_ONCE = 2**15
 SIZES = {"double": 8, "float": 4}  # bytes
 
 
@@ -40,6 +43,7 @@ class OnDevice:
 
 
 _device: ContextVar[OnDevice | None] = ContextVar("_device", default=None)
+_launched: ContextVar[set[str] | None] = ContextVar("_launched", default=None)  # functions, in the present block
 
 
 def current_device() -> OnDevice | None:
@@ -47,14 +51,26 @@ def current_device() -> OnDevice | None:
     return _device.get()
 
 
+def at_once(most: int) -> int:
+    """How many problems are worked on together: `most`, which bounds memory and the time between two reports; where a
+    device serves, with a thread for each, more."""
+    return most if current_device() is None else max(most, AT_ONCE)
+
+
 @contextmanager
 def working_on(device: OnDevice | None) -> Iterator[None]:
     """In this block kernels are made for a device."""
-    before = _device.set(device)
+    before, launched = _device.set(device), _launched.set(set())
     try:
         yield
     finally:
         _device.reset(before)
+        _launched.reset(launched)
+
+
+def has_served() -> bool:
+    """Whether a device has served a function in the present block of `working_on`."""
+    return bool(_launched.get())
 
 
 class Library:
@@ -112,6 +128,8 @@ class Kernel:
             told = f"solved by C on the CPU, and not on the device: {str(error).splitlines()[0]}"
             warnings.warn(told, DeviceWarning, stacklevel=2)
             return False
+        if (launched := _launched.get()) is not None:
+            launched.add(self.name)
         return True
 
     def _run(self, argument: Any, first: int, last: int) -> None:
