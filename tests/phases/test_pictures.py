@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.patches import Circle
 from torch import Tensor
 
 import torchgco
 from benchmarks.families.phases import CASES
 from tests.engines import compiled
 from tests.phases.test_phases import HEAVY, NOTHING, bounces, drive
+from tests.view.browser import Tab
+from tests.view.conftest import chromium as chromium
 from torchgco import (
     Dynamics,
     FunctionConstraint,
@@ -43,6 +48,51 @@ def driven() -> tuple[Phases, PhasesSolution]:
     then = drive(second, [2.0, 1.0], Spheres([[1.5, 0.55]], [0.1], 0.05), model=HEAVY, N=25)
     phases = Phases([first, then], [Jump(lambda x: torch.cat((x[..., :2], 0.3 * x[..., 2:]), -1))])
     return phases, torchgco.solve(phases)
+
+
+def take_off() -> tuple[Phases, PhasesSolution]:
+    """A phase with a position and one without."""
+    nowhere = replace(HEAVY, position=None)
+    first, then = (drive(torch.zeros(1, 4, dtype=D), [1.0, 0.0], model=model, N=5) for model in (HEAVY, nowhere))
+    phases = Phases([first, then])
+    return phases, torchgco.solve(phases)
+
+
+@pytest.mark.slow
+def test_a_film_has_each_phase_with_its_own_obstacles_and_jumps_in_an_instant() -> None:
+    phases, solution = driven()
+    film = torchgco.animate(phases, solution, b=1)
+    (scene,) = film._fig.axes
+    end = float(solution.begins[1, 1])
+    for t, phase in ((0.0, 0), (0.5 * end, 0), (end - 1e-6, 0), (end, 1), (1.4 * end, 1), (2.0 * end, 1)):
+        (vehicle,) = (one for one in film.at(t) if isinstance(one, Circle))
+        X = solution[phase].X[1, :, :2].numpy()
+        own = np.linspace(0.0, end, 26) + phase * end
+        np.testing.assert_allclose(vehicle.center, [np.interp(t, own, X[:, i]) for i in (0, 1)], atol=1e-9)
+        seen = [one.get_paths()[0].vertices for one in scene.collections if one.get_visible()]
+        centres = [0.5 * (corners.max(0) + corners.min(0)) for corners in seen]
+        np.testing.assert_allclose(centres, [[[0.5, 0.15], [1.5, 0.55]][phase]] * 2, atol=1e-6)  # plain, and grown
+        assert f"phase {phase + 1} of 2" in scene.get_title(loc="left")
+
+
+@pytest.mark.slow
+def test_a_page_has_the_phases_one_after_the_other(chromium: Callable[[], Tab], tmp_path: Path) -> None:
+    phases, solution = driven()
+    torchgco.show(phases, solution).save(tmp_path / "phases.html")
+    tab, end = chromium(), float(solution.begins[1, 1])
+    tab.size(600, 400)
+    tab.open(tmp_path / "phases.html")
+    page = "torchgcoView"
+    tab.evaluate(f"{page}.choose(1)")
+    assert tab.evaluate(f"{page}.flights.duration") == pytest.approx(2.0 * end, rel=1e-3)
+    for t, phase in ((0.0, 0), (0.5 * end, 0), (1.001 * end, 1), (1.4 * end, 1), (2.0 * end, 1)):
+        tab.evaluate(f"{page}.setTime({t})")
+        shown = tab.evaluate(f"{page}.flights.all.map((one) => one.body.visible)")
+        assert shown == [phase == 0, phase == 1]
+        assert tab.evaluate(f"{page}.obstacles.group.children.map((one) => one.visible)") == shown
+        x, y, _ = (float(word) for word in tab.evaluate("document.getElementById('picture').dataset.vehicle").split())
+        X, own = solution[phase].X[1].numpy(), np.linspace(0.0, end, 26) + phase * end
+        assert [x, y] == pytest.approx([float(np.interp(t, own, X[:, i])) for i in (0, 1)], abs=5e-3)
 
 
 @pytest.mark.slow
@@ -134,5 +184,11 @@ def test_wrong_use_gets_one_line() -> None:
         torchgco.plot(phases, solution[0])
     with pytest.raises(InputError, match="b: expected the place of a problem"):
         torchgco.plot(phases, solution, b=2)
-    with pytest.raises(InputError, match="problem: expected a Problem"):
-        torchgco.show(phases, solution)  # type: ignore[arg-type]
+    for picture in (torchgco.show, torchgco.animate):
+        with pytest.raises(InputError, match="solution: expected phases and their solution"):
+            picture(phases, solution[0])
+    flat, flown = take_off()
+    with pytest.raises(InputError, match="dynamics with a position in 2-D or 3-D, of all phases the same"):
+        torchgco.animate(flat, flown)
+    with pytest.raises(InputError, match=r"dynamics\.position: expected a model with a position"):
+        torchgco.show(flat, flown)
