@@ -25,6 +25,7 @@ from torchgco.compiled.stages import check_loop_in_free_time, follows, in_period
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current, held_on_cpu, open_loop, served_by
 from torchgco.lagrangian.lagrangian import shifted
+from torchgco.phases import Phases
 from torchgco.problem.alone import check_rows
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, clamped, held
@@ -84,6 +85,8 @@ class MPC:
         changes: Sequence[str] | None = None,
         tolerance: float | None = None,
     ) -> None:
+        if isinstance(problem, Phases):
+            raise InputError("problem", "a Problem; PhasesMPC takes phases", "Phases")
         asked = current_problem(problem)
         problem = held_on_cpu(asked)
         for name, value in (("horizon", problem.horizon), ("free_start", problem.free_start)):

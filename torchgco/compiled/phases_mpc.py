@@ -14,6 +14,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import measured
 from torchgco.base.options import PositiveOrInfinite, Seconds, check_value
+from torchgco.base.tree import is_users
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE
 from torchgco.compiled.compiling import compile
 from torchgco.compiled.mpc import time_of, within_bounds
@@ -203,12 +204,16 @@ def _at_start(row: Any, N: int) -> bool:
     return torch.arange(N + 1)[row.knots].tolist() == [0]
 
 
+def _reads_knots(part: Any) -> bool:
+    return is_users(part) and getattr(part, "reads_knots", False)
+
+
 def _check(one: Problem, where: str) -> None:
     """Refuse, in a line each, what a phase that is cut doesn't leave as it is."""
     wrong = {
         "time": "several segments" if one.time is not None and one.time.count > 1 else None,
         "free_start": "one" if one.free_start is not None else None,
-        "cost": next(iter(sorted(one.cost.names_by_stage())), "a function of k" if one.cost.reads_knots else None),
+        "cost": next(iter(sorted(one.cost.names_by_stage())), "a function of k" if _reads_knots(one.cost) else None),
         "constraints": "Gates" if has_gates(one) else None,
     }
     for name, got in wrong.items():
@@ -220,5 +225,7 @@ def _check(one: Problem, where: str) -> None:
         got = "obstacles that move" if getattr(row, "moving", False) else "a `previous`" if follows(row) else None
         if got is None and knots and knots != [0] and inner:
             got = f"rows at knots {knots}"
+        if got is None and _reads_knots(row):
+            got = "a function of k"
         if got is not None:
             raise InputError(f"{where}.constraints[{i}]", "rows at rest, of all knots, the first or the last", got)
