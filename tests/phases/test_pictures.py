@@ -19,14 +19,18 @@ from tests.phases.test_phases import HEAVY, NOTHING, bounces, drive
 from tests.view.browser import Tab
 from tests.view.conftest import chromium as chromium
 from torchgco import (
+    ControlBounds,
     Dynamics,
     FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
     InputError,
     Jump,
     Link,
     Phases,
     PhasesSolution,
     Problem,
+    QuadraticCost,
     Spheres,
 )
 
@@ -172,6 +176,60 @@ def test_free_starts_links_and_loops_are_stationary_and_some_are_asked_for() -> 
     lap = Phases([out, back], [Link()], loop=Link(components=[0, 1]))
     found = torchgco.certify(lap, torchgco.solve(lap))
     assert float(found.kkt_residual) < 1e-6 and float(found.dynamics_residual) < 1e-12
+
+
+def test_steps_of_two_phases_are_those_of_one_longer_problem() -> None:
+    lag = FunctionDynamics(
+        lambda x, u: torch.stack((x[..., 1], 9.0 * (u[..., 0] - x[..., 1])), -1), n=2, m=1, dt=0.1, integrator="rk4"
+    )
+    cost = lambda end: QuadraticCost([1.0, 0.1], [0.1], [end, end], x_ref=[1.0, 0.0])
+    x0, rows = torch.tensor([[0.0, 0.0], [0.3, 1.0]], dtype=D), [ControlBounds(-0.9, 0.9)]
+    whole = Problem(lag, cost(9.0), rows, x0, 20)
+    found = torchgco.solve(whole, solver="interior_point")
+    alone = torchgco.certify(whole, found.X, found.U, multipliers=found.multipliers.lam)
+    phases = Phases([Problem(lag, cost(0.0), rows, x0, 8), Problem(lag, cost(9.0), rows, x0, 12)])
+    solution = torchgco.solve(phases)
+    of_all = torchgco.certify(phases, solution)
+    torch.testing.assert_close(of_all.step_cost, alone.step_cost, rtol=1e-4, atol=0.0)
+    # The range of a state is that of its own phase.
+    parts = [torchgco.certify(one, part.X, part.U) for one, part in zip(solution.problems, solution, strict=True)]
+    assert torch.equal(of_all.step_error, torch.maximum(parts[0].step_error, parts[1].step_error))
+    some = torchgco.certify(phases, solution, asked=torch.tensor([False, True]))
+    assert some.step_cost.isnan().tolist() == [True, False] and bool(some.step_cost[1] == of_all.step_cost[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_step_costs_of_all_phases_tell_what_half_of_dt_changes(seed: int) -> None:
+    """A fall and a push back, with drag, in steps of Euler: those of the fall count through the jump and the push. They
+    do to first order: what they miss falls as the square of dt."""
+    random = np.random.default_rng(seed)
+    drag, kept = random.uniform(0.1, 0.5), random.uniform(0.4, 0.8)
+    rates = lambda x, u: torch.stack((x[..., 1], u[..., 0] - 9.81 - drag * x[..., 1]), -1)
+    back = FunctionConstraint(lambda x: x - x.new_tensor([1.0, 0.0]), "equality", knots=[-1], name="back")
+    ground = FunctionConstraint(lambda x: x[..., :1], "equality", knots=[-1], name="ground")
+    start, hit = torch.tensor([[1.0, 0.0]], dtype=D), torch.tensor([[0.0, 2.0]], dtype=D)
+
+    def flown(dt: float, halved: bool) -> tuple[float, float]:
+        """The cost, and the step cost."""
+        effort = FunctionCost(lambda x, u: dt * u[..., 0] ** 2)
+        euler = lambda x, u, h: x + h * rates(x, u)
+        twice = lambda x, u: euler(euler(x, u, 0.5 * dt), u, 0.5 * dt)
+        model = FunctionDynamics(twice if halved else rates, 2, 1, dt, integrator="none" if halved else "euler")
+        fall, rise = round(0.45 / dt), round(0.6 / dt)
+        parts = Problem(model, effort, [ground], start, fall), Problem(model, effort, [back], hit, rise)
+        phases = Phases(parts, [Jump(lambda x: torch.stack((x[..., 0], -kept * x[..., 1]), -1))])
+        solution = torchgco.solve(phases)
+        certificate = torchgco.certify(phases, solution)
+        assert bool(certificate.step_cost.isnan()) == halved
+        return float(solution.cost), float(certificate.step_cost)
+
+    missed = []
+    for dt in (0.0125, 0.00625):
+        (cost, told), (finer, _) = flown(dt, False), flown(dt, True)
+        missed.append(abs(told - abs(finer - cost) / cost))
+        assert told > 0.004
+    assert missed[1] < 0.35 * missed[0]
 
 
 def test_wrong_use_gets_one_line() -> None:

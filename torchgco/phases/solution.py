@@ -20,7 +20,7 @@ from torchgco.constraints.base import ADMITTED
 from torchgco.explaining.explain import Account
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.judge import Verdict, doubled, in_double, judge
-from torchgco.judging.steps import Costates
+from torchgco.judging.steps import Costates, cost_of, differences
 from torchgco.kernels import costates, current
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
@@ -211,16 +211,36 @@ def certify_phases(phases: Phases, solution: Any, asked: Tensor | None) -> Certi
     """
     _check(phases, solution)
     phases, found = phases.current(), solution.found.detach()
-    whole = certify(Whole(phases).problem, found.X, found.U, asked, found.multipliers.lam)
-    each = []
+    lowered = Whole(phases)
+    whole = certify(lowered.problem, found.X, found.U, asked, found.multipliers.lam)
+    each = list[Certificate]()
     for member, part in zip(phases.members, solution.detach(), strict=True):
         here = member._with({"x0": part.X[:, 0].to(member.x0.dtype)}, member.known)
         each.append(certify(here, part.X, part.U, asked, part.multipliers.lam, part.times))
     least, most = torch.fmin, torch.fmax  # NaN of phases without a position, or a field
     return replace(
         whole, clearance=reduce(least, (one.clearance for one in each)),
-        step_error=reduce(most, (one.step_error for one in each)),
+        step_error=reduce(most, (one.step_error for one in each)), step_cost=_step_cost(lowered, solution.detach(), whole),
     )  # fmt: skip
+
+
+def _step_cost(whole: Whole, solution: Any, certificate: Certificate) -> Tensor:
+    """By how much the steps of all phases change the cost of all, as of `StepErrors`; NaN where nothing is certified,
+    or no phase has a known field."""
+    costs, none = torch.full_like(certificate.dynamics_residual, torch.nan), True
+    rows, found = (~certificate.dynamics_residual.isnan()).nonzero().flatten(), solution.found
+    problem = in_double(whole.problem.take(rows))
+    X, U = (z[rows].double() for z in (found.X, found.U))
+    e = X.new_zeros(len(rows), problem.N, problem.n)
+    for member, part, span in zip(whole.members, solution, whole.spans, strict=True):
+        times = None if part.times is None else part.times[rows].double()
+        own = part.X[rows].double(), part.U[rows].double()
+        of_phase = differences(in_double(member.take(rows)), *own, times)
+        if of_phase is not None:
+            e[:, span.stages, : member.n], none = of_phase, False
+    if len(rows) and not none:
+        costs[rows] = cost_of(problem, X, U, e, None, [lam[rows].double() for lam in found.multipliers.lam])
+    return costs
 
 
 def _check(phases: Phases, solution: Any) -> None:
