@@ -112,9 +112,7 @@ def animate(
     return solution_film(current_problem(problem), solution.detach(), b)
 
 
-def show(
-    problem: Problem | Fleet | Phases, solution: Solution | FleetSolution | PhasesSolution
-) -> HtmlPage:
+def show(problem: Problem | Fleet | Phases, solution: Solution | FleetSolution | PhasesSolution) -> HtmlPage:
     """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
 
     Of fleets with a colour for each vehicle. Of phases with a colour for each, one after the other in time; each one's

@@ -1,9 +1,9 @@
 """A problem compiled once and solved again and again: `compile`, and the numbers that calls may change.
 
-`compiled.Compiled` keeps a problem packed for C, `numbers` names what may be written there, `phases.CompiledPhases` keeps
-phases so; `compiling.compile` makes both. `mpc.MPC` is a receding horizon over a problem, `phases_mpc.PhasesMPC` a
-shrinking one over phases, `fleet_mpc.FleetMPC` one of several vehicles, `holding` what it returns where no plan is found. It
-imports all rooms but `experiments`. Begin with `compiled.py`.
+`compiled.Compiled` keeps a problem packed for C, `phases.CompiledPhases` phases; `compiling.compile` makes both, and
+`numbers` names what may be written there. `mpc.MPC` is a receding horizon over a problem, `phases_mpc.PhasesMPC` a
+shrinking one over phases, `fleet_mpc.FleetMPC` one of several vehicles, `holding` what it returns where no plan is
+found. It imports all rooms but `experiments`. Begin with `compiled.py`.
 """
 
 from torchgco.compiled.answer import Answer as Answer

@@ -18,7 +18,7 @@ from torchgco.base import clock
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number
 from torchgco.base.options import Positive, check_value
-from torchgco.base.shapes import CPU, check_untransformed, computing_on
+from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.answer import Answer
@@ -41,7 +41,7 @@ from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.phases import PhasesSolution
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times
-from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.interior import PENALTY, InteriorPoint
 from torchgco.tracing import traced_like
@@ -68,6 +68,7 @@ class Compiled:
     """
 
     numbers: Numbers
+    _problem: Any
 
     def __init__(
         self, problem: Any, solver: str, changes: Sequence[str] | None, receding: bool, interior: InteriorPoint
@@ -135,8 +136,9 @@ class Compiled:
         max_seconds: float | None = None,
         numbers: Mapping[str, Any] | None = None,
         **named: Any,
-    ) -> Answer:
-        """Solve with new numbers; those that aren't named keep their values.
+    ) -> Any:
+        """Solve with new numbers; those that aren't named keep their values. Returns an `Answer`, a `PhasesAnswer` of
+        phases.
 
         Args:
             warm: begin with the last answer, where that was a solution.
@@ -162,7 +164,7 @@ class Compiled:
         elapsed: float | None = None,
         max_seconds: float | None = None,
         begin: Begin | None = None,
-    ) -> Answer:
+    ) -> Any:
         """The same, with the new numbers by full names.
 
         Args:

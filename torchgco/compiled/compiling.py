@@ -62,7 +62,9 @@ def compile(
         interior = replace(interior, tolerance=check_value(tolerance, Positive, "tolerance"))
     members: Any = problem.members if isinstance(problem, Phases) else [problem]
     if receding and (whole or members[0].time is not None):
-        what = "of phases, which PhasesMPC serves" if whole else "where the time is free: calls say what has `elapsed`, s"
+        what = (
+            "of phases, which PhasesMPC serves" if whole else "where the time is free: calls say what has `elapsed`, s"
+        )
         raise InputError("receding", f"False {what}", True)
     if any(isinstance(part, Integral) for one in members for part in one.constraints):
         raise InputError("problem", "one without Integral in compiled problems and loops", "Integral")

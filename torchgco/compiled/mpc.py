@@ -265,7 +265,9 @@ class MPC:
         )  # fmt: skip
 
     def _time(self, t: float | None) -> float:
-        return time_of(t, None if self.answer is None else self.t, self.t if self.answer is None else self.t + self.period)
+        return time_of(
+            t, None if self.answer is None else self.t, self.t if self.answer is None else self.t + self.period
+        )
 
 
 def within_bounds(problem: Problem, u: Tensor) -> Tensor:

@@ -330,5 +330,8 @@ def _crossed(views: dict[str, Floats], where: str, new: Any) -> Wrong:
     inner: Sequence[Floats] = [times["guess"]] if "guess" in times else []
     for low, high in zip([times["least"], *inner], [*inner, times["most"]], strict=True):
         if (low > high).any():
-            return f"{where}.least at most {where}.guess and {where}.most", f"{low[low > high][0]:g} and {high[low > high][0]:g}"
+            return (
+                f"{where}.least at most {where}.guess and {where}.most",
+                f"{low[low > high][0]:g} and {high[low > high][0]:g}",
+            )
     return None

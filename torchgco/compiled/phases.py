@@ -97,8 +97,8 @@ class KeptPhases(KeptLifted):
         if not changed - {START}:
             return set()
         kept, new, parts = self.problem, Whole(now).problem, set[str | int]()
-        n, first = self._given.shape[1], self._moving[0][:, 0]
-        self._x0[:, n + self._frees :] = new.x0[:, n + self._frees :].numpy()
+        first = self._given.shape[1] + self._frees
+        self._x0[:, first:] = new.x0[:, first:].numpy()
         pairs: Iterable[tuple[str | int, Any, Any]] = [
             ("dynamics", kept.dynamics, new.dynamics), ("cost", kept.cost, new.cost),
             *((i, *pair) for i, pair in enumerate(zip(kept.constraints, new.constraints, strict=True))),
@@ -122,7 +122,7 @@ def _refreshed(phases: Phases) -> Phases:
 
 
 def _numbers_of(phases: Phases) -> list[Number]:
-    collected = []
+    collected = list[Number]()
     for i, one in enumerate(phases.members):
         numbers = numbers_of(one, f"phases[{i}].")
         collected += numbers if i == 0 else [number for number in numbers if number.part != "x0"]
@@ -130,7 +130,7 @@ def _numbers_of(phases: Phases) -> list[Number]:
         where = f"jumps[{i}]"
         collected += numbers_of_fields(jump, where, where)
         for j, row in enumerate(jump.constraints):
-            collected += row.numbers(f"{where}.constraints[{j}]", where)
+            collected += row.numbers(f"{where}.constraints[{j}]", j)
     for number in collected:
         number.part = number.name
     return collected
@@ -147,6 +147,7 @@ class CompiledPhases(Compiled):
     _form: ClassVar[Any] = staticmethod(lambda phases: Whole(phases).problem)
     _numbers_of: ClassVar[Any] = staticmethod(_numbers_of)
     _kept: KeptPhases | None
+    _problem: Any
 
     @property
     def _in_time(self) -> bool:

@@ -221,8 +221,7 @@ class Phases:
 
     def take(self, index: Rows) -> Phases:
         """The phases of the problems in `index` (int64, (b,), or a slice)."""
-        parts = ([part.take(index) for part in parts] for parts in (self.members, self.between))
-        return self.of_parts(*parts)
+        return self.of_parts([one.take(index) for one in self.members], [jump.take(index) for jump in self.between])
 
     def renewed(self) -> Phases:
         """The same, with nothing kept that was computed from their parts."""

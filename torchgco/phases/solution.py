@@ -220,7 +220,8 @@ def certify_phases(phases: Phases, solution: Any, asked: Tensor | None) -> Certi
     least, most = torch.fmin, torch.fmax  # NaN of phases without a position, or a field
     return replace(
         whole, clearance=reduce(least, (one.clearance for one in each)),
-        step_error=reduce(most, (one.step_error for one in each)), step_cost=_step_cost(lowered, solution.detach(), whole),
+        step_error=reduce(most, (one.step_error for one in each)),
+        step_cost=_step_cost(lowered, solution.detach(), whole),
     )  # fmt: skip
 
 

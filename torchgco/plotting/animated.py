@@ -17,7 +17,7 @@ from matplotlib.patches import Circle, Polygon
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.animation import PALE
-from torchgco.plotting.bodies import ABOVE, SIDE, Plane, silhouettes
+from torchgco.plotting.bodies import Plane, silhouettes
 from torchgco.plotting.layouts import ROCK
 from torchgco.plotting.problems import WIDTH, Course, Leg, SceneMap, in_one_box, is_shared
 from torchgco.plotting.scene import World, distances
@@ -112,9 +112,9 @@ def _present(legs: Sequence[Leg], place: int, t: float) -> int:
 
 def _standing(scene: SceneMap, axes: Sequence[Axes]) -> list[Artist]:
     """Draw what is at rest in a scene; what was drawn."""
-    known = [set(ax.get_children()) for ax in axes]
+    known = {artist for ax in axes for artist in ax.get_children()}
     _at_rest(scene).draw_into(axes)
-    return [artist for ax, before in zip(axes, known, strict=True) for artist in ax.get_children() if artist not in before]
+    return [artist for ax in axes for artist in ax.get_children() if artist not in known]
 
 
 def _at_rest(scene: SceneMap) -> SceneMap:

@@ -41,9 +41,9 @@ class ShownPhase:
 
     def packed(self) -> dict[str, Any]:
         """As the page reads it: its stages, s, and its vehicle."""
-        shape = shape_of(self.problem)
+        shape, dt = shape_of(self.problem), getattr(self.problem.dynamics, "dt", None) or 1.0
         return {
-            "first": self.first, "stages": self.problem.N, "dt": number(getattr(self.problem.dynamics, "dt", None) or 1.0),
+            "first": self.first, "stages": self.problem.N, "dt": number(dt),
             "body": look_of(self.problem.dynamics).body, "radius": number(radius_of(self.problem)),
             "shape": None if shape is None else shape.packed(),
         }  # fmt: skip

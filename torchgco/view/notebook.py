@@ -72,9 +72,7 @@ def show_phases(members: Sequence[Problem], solutions: Sequence[Solution], begin
         if (sizes := [p.position.stop - p.position.start for p in (first, one)])[0] != sizes[1]:
             raise InputError("problem", f"a position in {sizes[0]}-D of all phases", f"{sizes[1]}-D of {name}")
         phase = ShownPhase(one, knots)
-        flights.append(
-            [replace(f, phase=phase, worst=np.where(f.worst < 0, -1, f.worst + before)) for f in shown]
-        )
+        flights.append([replace(f, phase=phase, worst=np.where(f.worst < 0, -1, f.worst + before)) for f in shown])
         constraints += [f"{kind_of(part)} of {name}" for part in one.constraints]
         own, dt = _times(one, found)
         own = dt * np.arange(one.N + 1) if own is None else own
