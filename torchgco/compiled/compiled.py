@@ -51,7 +51,7 @@ CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEA
 
 
 @contextmanager
-def _plainly() -> Iterator[None]:
+def plainly() -> Iterator[None]:
     """Tensors that are kept lie on the CPU and can be written in place, whatever the caller's default and mode are.
 
     A warm call makes none, and does without: this takes as long as a part of the solve.
@@ -76,7 +76,7 @@ class Compiled:
         self._device = problem.x0.device
         self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
         self._given: Any = problem
-        with _plainly():
+        with plainly():
             self._begin(self._owning(problem if self._device.type == CPU.type else held_on_cpu(problem)))
 
     # What a problem is compiled by; `phases.CompiledPhases` has phases in its place.
@@ -206,7 +206,7 @@ class Compiled:
         """The problem, or phases, whose parts hold the numbers as they are."""
         return self._problem
 
-    @_plainly()
+    @plainly()
     def solution(self) -> Solution:
         """The last answer with multipliers, costs and statuses; costs of what C solved are by the numbers as they are.
 
@@ -230,7 +230,7 @@ class Compiled:
             self._found = self._packed_solution(self._warm)
         return self._found
 
-    @_plainly()
+    @plainly()
     def stale(self) -> str | None:
         """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
 
@@ -249,7 +249,7 @@ class Compiled:
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 
-    @_plainly()
+    @plainly()
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
         names = "solver", "interior", "receding", "changes", "_device"
@@ -259,7 +259,7 @@ class Compiled:
         problem = state.pop("problem")
         vars(self).update(state)
         self._given = None
-        with _plainly():
+        with plainly():
             self._begin(self._owning(problem))
 
     def _note(self, number: Number) -> None:
@@ -272,7 +272,7 @@ class Compiled:
         assert kept is not None
         parts = self._changed
         if isinstance(kept, KeptLifted):
-            with _plainly():
+            with plainly():
                 kept.shift(shift)
                 parts = kept.read(parts, self.now)
         elif shift:
@@ -287,7 +287,7 @@ class Compiled:
         self._changed.clear()
         kept.start()
         if kept.is_outdated:  # C reads what functions capture as it is now
-            with _plainly():
+            with plainly():
                 if not kept.refresh_captured():
                     self._pack(self.now.renewed())
 
@@ -301,7 +301,7 @@ class Compiled:
             self._refresh(shift)
         kept = self._kept
         if kept is None:
-            with _plainly():
+            with plainly():
                 self._found = self._by_solver(shift if able.all() else None, until)
                 return self._answer(able & able.all(), began)
         good = late = np.zeros_like(able)
@@ -313,7 +313,7 @@ class Compiled:
             kept.iterations.zero_()
         self._found = None
         if not good.all():
-            with _plainly():
+            with plainly():
                 self._found, again = self._packed_solution(good), torch.from_numpy(~(good | late)).nonzero().flatten()
                 if again.numel() > 0 and begin is not None:
                     again = self._begun(self._found, again, begin, until)
@@ -406,6 +406,6 @@ class Compiled:
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
         t = last.times if last is not None else None
         if last is None and isinstance(kept, KeptInTime):
-            with _plainly():
+            with plainly():
                 t = kept.times
         return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), clock.seconds() - began, t)

@@ -112,8 +112,8 @@ def _short(name: str) -> str:
 def with_own_numbers(problem: Problem) -> Problem:
     """The same problems, with memory of its own for every number of every problem."""
     B = problem.B
-    parts: dict[str, Any] = {name: _own(getattr(problem, name), B) for name in ("dynamics", "constraints", "time")}
-    parts |= {"x0": problem.x0.clone(), "cost": _own(problem.cost.by_knot(problem.N), B)}
+    parts: dict[str, Any] = {name: owned(getattr(problem, name), B) for name in ("dynamics", "constraints", "time")}
+    parts |= {"x0": problem.x0.clone(), "cost": owned(problem.cost.by_knot(problem.N), B)}
     goal = problem.goal
     if goal is not None and goal.required:
         row = parts["constraints"][-1]
@@ -147,7 +147,7 @@ def with_numbers_as_they_are(problem: Problem) -> Problem:
     return now
 
 
-def _own(part: Any, B: int) -> Any:
+def owned(part: Any, B: int) -> Any:
     """A part of a problem with copies of all its numbers, one for every problem."""
 
     def each(value: Tensor) -> Tensor:
@@ -247,11 +247,11 @@ class KeptInTime(KeptLifted):
         new, n = in_time(now), self.user.n
         self._x0[:, n + 1 :] = new.x0[:, n + 1 :].numpy()  # controls before
         if "time" in changed:
-            _copy(self.whole.cost, new.cost)
+            overwrite(self.whole.cost, new.cost)
             places += range(len(self.user.constraints), len(new.constraints))
             changed = changed.union({"cost"}, places)
         for i in places:
-            _copy(self.whole.constraints[i], new.constraints[i])
+            overwrite(self.whole.constraints[i], new.constraints[i])
         return changed
 
 
@@ -311,7 +311,7 @@ def _differ(users: Any, lifted: Any) -> bool:
     return any(tensor.data_ptr() not in there for tensor in own_tensors(users))
 
 
-def _copy(old: Any, new: Any) -> None:
+def overwrite(old: Any, new: Any) -> None:
     for there, here in zip(own_tensors(old), own_tensors(new), strict=True):
         if there.data_ptr() != here.data_ptr():
             there.copy_(here)

@@ -14,12 +14,12 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.tree import passed_on
 from torchgco.compiled.answer import Answer
-from torchgco.compiled.compiled import Compiled, _plainly
+from torchgco.compiled.compiled import Compiled, plainly
 from torchgco.compiled.numbers import (
     KeptLifted,
-    _copy,
-    _own,
     numbers_of,
+    overwrite,
+    owned,
     with_numbers_as_they_are,
     with_own_numbers,
 )
@@ -56,10 +56,12 @@ class PhasesAnswer(OfPhases):
     def _part(self, i: int) -> Answer:
         member, form = self.whole.members[i], self.whole.forms[i]
         X, U, K = self._trajectory(i)
-        t = times(member) if member.time is None else times_of(member, factors_in(member, X))
+        t = None if member.time is None else times_of(member, factors_in(member, X))
+        if t is None and getattr(member.dynamics, "dt", None) is not None:
+            t = times(member).expand(len(X), -1)
         return replace(
             self.found, X=X[..., : member.n].contiguous(), U=U[..., : member.m].contiguous(), K=K,
-            violation=violation(form.constraints, X, U), t=t.expand(len(X), -1),
+            violation=violation(form.constraints, X, U), t=t,
         )  # fmt: skip
 
 
@@ -104,7 +106,7 @@ class KeptPhases(KeptLifted):
             *((i, *pair) for i, pair in enumerate(zip(kept.constraints, new.constraints, strict=True))),
         ]  # fmt: skip
         for place, old, other in pairs:
-            _copy(old, other)
+            overwrite(old, other)
             parts.add(place)
         return parts
 
@@ -112,7 +114,7 @@ class KeptPhases(KeptLifted):
 def _owning(phases: Phases) -> Phases:
     """The same phases, with memory of its own for every number of every problem."""
     members = [with_own_numbers(one) for one in phases.members]
-    return phases.of_parts(members, [_own(jump, phases.B) for jump in phases.between])
+    return phases.of_parts(members, [owned(jump, phases.B) for jump in phases.between])
 
 
 def _refreshed(phases: Phases) -> Phases:
@@ -177,7 +179,7 @@ class CompiledPhases(Compiled):
 
     def solution(self) -> Any:
         """The last answer with multipliers, costs and statuses, as of `torchgco.solve`; see `Compiled.solution`."""
-        with _plainly():
+        with plainly():
             last = self._last
             if last is None:
                 raise InputError("mpc", "a call before its solution is asked for", "none")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.numbers import measured
+from torchgco.base.numbers import as_floats, measured
 from torchgco.base.options import PositiveOrInfinite, Seconds, check_value
 from torchgco.base.tree import is_users
 from torchgco.compiled.compiled import CONVERGED, FEASIBLE
@@ -129,7 +129,7 @@ class PhasesMPC:
         values = self._values | self.numbers.named(numbers, named)
         there = {name: value for old, value in values.items() if (name := self._named(old, place)) is not None}
         state = measured(x, 1, self._phases.members[place].n)
-        there |= {"phases[0].x0": state} | self._left(place, now - began)
+        there |= {"phases[0].x0": state} | self._left(place, now - began, values)
         loop = self._loops[place]
         for name, value in there.items():
             loop.numbers.find(name).checked(value)
@@ -155,13 +155,16 @@ class PhasesMPC:
             raise InputError("t", f"a time before {self.begins[-1]:g} s, when the last phase is over", now)
         return place + len(due), due[-1] if due else began
 
-    def _left(self, place: int, seconds: float) -> dict[str, Any]:
-        """The bounds on the rest of the present phase, so many seconds after it began."""
+    def _left(self, place: int, seconds: float, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The bounds on the rest of the present phase, so many seconds after it began, of those that steps have given,
+        or the problem."""
         time, gone = self._times[place], seconds / self._nominal[place]
-        assert time is not None
-        names = ("least", "most") if time.guess is None else ("least", "most", "guess")
-        rest = {name: (getattr(time, name) - gone).clamp(min=STAGE_ROUNDING).numpy() for name in names}
-        return {f"phases[0].time.{name}": value for name, value in rest.items()}
+        rest = dict[str, Any]()
+        for name in ("least", "most", "guess"):
+            whole = values.get(f"phases[{place}].time.{name}", getattr(time, name))
+            if whole is not None:
+                rest[f"phases[0].time.{name}"] = np.maximum(as_floats(whole, name) - gone, STAGE_ROUNDING)
+        return rest
 
     def _named(self, name: str, place: int) -> str | None:
         """The name of a number among what is left from a phase on; None where that is over."""

@@ -73,7 +73,10 @@ class OfPhases:
         Raises:
             InputError: a model without a time step.
         """
-        lengths = torch.stack([one.duration for one in self.parts], dim=-1)
+        each = [one.duration for one in self.parts]
+        if any(length is None for length in each):
+            raise InputError("phases", "models with a time step", "one without")
+        lengths = torch.stack(each, dim=-1)
         return torch.cat((torch.zeros_like(lengths[:, :1]), lengths.cumsum(-1)), dim=-1)
 
     @property
