@@ -8,7 +8,7 @@ from typing import Any
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Positive, check_value
-from torchgco.base.shapes import check_untransformed
+from torchgco.base.shapes import CPU, check_untransformed
 from torchgco.compiled.compiled import Compiled
 from torchgco.compiled.phases import CompiledPhases
 from torchgco.constraints.link import Integral
@@ -68,6 +68,8 @@ def compile(
         raise InputError("receding", f"False {what}", True)
     if any(isinstance(part, Integral) for one in members for part in one.constraints):
         raise InputError("problem", "one without Integral in compiled problems and loops", "Integral")
+    if whole and problem.x0.device.type != CPU.type:
+        raise InputError("problem", "phases on the CPU", str(problem.x0.device))
     if whole:
         return CompiledPhases(problem, solver or "interior_point", changes, False, interior)
     return Compiled(problem, solver or "gco", changes, receding, interior)
