@@ -36,7 +36,7 @@ from torchgco.base.errors import (
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
 from torchgco.baselines import Hold, IteratedMPPI
-from torchgco.compiled import MPC, Answer, Compiled, FleetMPC, MPPIController, compile
+from torchgco.compiled import MPC, Answer, Compiled, FleetMPC, MPPIController, PhasesAnswer, PhasesMPC, compile
 from torchgco.constraints import (
     BetweenKnots,
     Cone,
@@ -104,7 +104,7 @@ __all__ = [  # noqa: RUF022
     # solving it
     "solve", "Guess", "tightened", "MPC", "compile", "Compiled", "Answer", "export_c", "load_c",
     "LoadedController", "compare", "Solution", "plot", "animate", "show", "Status", "presets",
-    "Fleet", "FleetSolution", "FleetMPC", "Phases", "Jump", "PhasesSolution",
+    "Fleet", "FleetSolution", "FleetMPC", "Phases", "Jump", "PhasesSolution", "PhasesMPC", "PhasesAnswer",
     "plan_batch", "Restarts", "MultiStart", "AugmentedLagrangian", "ILQR", "InteriorPoint", "LineSearch",
     "Roadmap", "PathProposals", "GCO", "MPPI", "MPPIController", "IteratedMPPI", "Hold",
     # checking the result

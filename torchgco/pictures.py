@@ -14,6 +14,7 @@ from torchgco.problem.problem import Problem, current_problem
 from torchgco.solution import Solution
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.animation import FuncAnimation
     from matplotlib.figure import Figure
 
@@ -54,8 +55,13 @@ def plot(
 
 
 def _phases_figure(phases: Any, solution: Any, b: Any) -> Figure:
-    from torchgco.plotting.problems import phases_figure  # matplotlib takes a second to load
+    from torchgco.plotting.problems import figure_of, legs_of  # matplotlib takes a second to load
 
+    return figure_of(legs_of(*_phases_of(phases, solution), b))
+
+
+def _phases_of(phases: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[Solution], np.ndarray, np.ndarray]:
+    """Problems and solutions of phases, when each begins, (B, P+1), s, and the costs of all, (B,)."""
     if not isinstance(phases, Phases) or not isinstance(solution, PhasesSolution) or len(solution) != len(phases):
         raise InputError("solution", "phases and their solution", type(solution).__name__)
     solution = solution.detach()
@@ -64,7 +70,7 @@ def _phases_figure(phases: Any, solution: Any, b: Any) -> Figure:
     except InputError:  # models without a time step: knots are counted
         counts = torch.tensor([0, *(one.N for one in solution.problems)]).cumsum(0)
         begins = counts.expand(phases.B, -1)
-    return phases_figure(solution.problems, solution.parts, begins.cpu().numpy(), solution.cost.cpu().numpy(), b)
+    return solution.problems, solution.parts, begins.cpu().numpy(), solution.cost.cpu().numpy()
 
 
 def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
@@ -81,11 +87,14 @@ def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[So
     return fleet.members, solution.vehicles
 
 
-def animate(problem: Problem, solution: Solution, b: int | Sequence[int] = 0) -> FuncAnimation:
+def animate(
+    problem: Problem | Phases, solution: Solution | PhasesSolution, b: int | Sequence[int] = 0
+) -> FuncAnimation:
     """A film of trajectories among obstacles, also those that move, at 20 pictures a second in real time.
 
     A notebook plays it; `.save("way.gif")` writes it, and where ffmpeg is installed `.save("way.mp4")`. In space from
-    above and from the side. Flights of over 12 s are shown faster.
+    above and from the side. Flights of over 12 s are shown faster. Of phases all of them one after the other, each with
+    its own body, among its own obstacles; a jump is an instant.
 
     Args:
         problem, solution: as solved.
@@ -93,18 +102,21 @@ def animate(problem: Problem, solution: Solution, b: int | Sequence[int] = 0) ->
 
     Raises:
         InputError: a place that isn't there, a solution of other problems, other obstacles, or dynamics without a
-            position in 2-D or 3-D.
+            position in 2-D or 3-D, the same in all phases.
     """
-    problem = current_problem(problem)
-    from torchgco.plotting.animated import solution_film  # matplotlib takes a second to load
+    from torchgco.plotting.animated import film_of, solution_film  # matplotlib takes a second to load
+    from torchgco.plotting.problems import legs_of
 
-    return solution_film(problem, solution.detach(), b)
+    if isinstance(problem, Phases) or isinstance(solution, PhasesSolution):
+        return film_of(legs_of(*_phases_of(problem, solution), b), b)
+    return solution_film(current_problem(problem), solution.detach(), b)
 
 
-def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPage:
+def show(problem: Problem | Fleet | Phases, solution: Solution | FleetSolution | PhasesSolution) -> HtmlPage:
     """A page of the trajectories that one turns around, in a notebook or, with `.save(path)`, as an HTML file.
 
-    Of fleets with a colour for each vehicle.
+    Of fleets with a colour for each vehicle. Of phases with a colour for each, one after the other in time; each one's
+    vehicle and obstacles are there while it lasts.
 
     Raises:
         InputError: a problem of another form, an empty one, or dynamics without a position in 2-D or 3-D.
@@ -113,5 +125,7 @@ def show(problem: Problem | Fleet, solution: Solution | FleetSolution) -> HtmlPa
 
     if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
         return notebook.show_fleet(*_fleet_of(problem, solution))
+    if isinstance(problem, Phases) or isinstance(solution, PhasesSolution):
+        return notebook.show_phases(*_phases_of(problem, solution)[:3])
     problem = current_problem(problem)
     return notebook.show(problem, solution.detach())

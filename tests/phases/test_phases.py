@@ -329,7 +329,8 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: torchgco.solve(Phases(PAIR), guesses=[]), "solve.guesses: expected None of phases"),
     (lambda: torchgco.solve(Phases(PAIR), smoothing=-0.1), "smoothing: expected"),
     (lambda: torchgco.solve(Phases([drive(HERE, [1.0, 0], time=FreeTime())]), solver="al_ilqr"), "solver: expected"),
-    (lambda: torchgco.compile(Phases(PAIR)), "problem: expected a Problem"),  # type: ignore[arg-type]
+    (lambda: torchgco.export_c(Phases(PAIR), "made"), "problem: expected a Problem"),  # type: ignore[arg-type]
+    (lambda: torchgco.export_c(torchgco.compile(Phases(PAIR)), "made"), "problem: expected a Problem"),
     (lambda: torchgco.MPC(Phases(PAIR)), "problem: expected a Problem"),  # type: ignore[arg-type]
     (lambda: torchgco.judge(Phases(PAIR), 3), "solution: expected a PhasesSolution"),  # type: ignore[call-overload]
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""compile: one problem compiled and packed once, and solved again and again with other numbers."""
+"""Compiled: one problem compiled and packed once, and solved again and again with other numbers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import torch
@@ -18,87 +18,46 @@ from torchgco.base import clock
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number
 from torchgco.base.options import Positive, check_value
-from torchgco.base.shapes import CPU, check_untransformed, computing_on
+from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.answer import Answer
 from torchgco.compiled.numbers import (
     KeptInTime,
+    KeptLifted,
     Numbers,
     kept_in_time,
     later,
-    numbers_in_time,
     numbers_of,
     with_numbers_as_they_are,
     with_own_numbers,
 )
-from torchgco.constraints.link import Integral
 from torchgco.explaining.explain import Account
 from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, is_mixed, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
 from torchgco.native.interior import InteriorEngine, Kept
-from torchgco.presets import named
+from torchgco.phases import PhasesSolution
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times
-from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.interior import PENALTY, InteriorPoint
 from torchgco.tracing import traced_like
 
 Begin: TypeAlias = Callable[[Problem, Tensor], tuple[Tensor, Tensor]]
-SOLVERS = "gco", "interior_point"
 CONVERGED, FEASIBLE, TIME_LIMIT = (int(s) for s in (Status.CONVERGED, Status.FEASIBLE, Status.TIME_LIMIT))
 
 
 @contextmanager
-def _plainly() -> Iterator[None]:
+def plainly() -> Iterator[None]:
     """Tensors that are kept lie on the CPU and can be written in place, whatever the caller's default and mode are.
-    A warm call makes none, and does without: this takes as long as a part of the solve."""
+
+    A warm call makes none, and does without: this takes as long as a part of the solve.
+    """
     with torch.inference_mode(False), computing_on(CPU):
         yield
-
-
-def compile(
-    problem: Problem,
-    solver: str = "gco",
-    changes: Sequence[str] | None = None,
-    receding: bool = False,
-    tolerance: float | None = None,
-) -> Compiled:
-    """A problem whose code is traced, compiled and packed once, for solves with other numbers: a receding horizon, say.
-
-        mpc = torchgco.compile(problem, receding=True)
-        answer = mpc(x0=x, x_ref=reference)
-
-    The first call solves as `torchgco.solve` does. Later ones begin with the last trajectories and multipliers, by the
-    interior point in C; what that doesn't solve, `solver` solves again. Tensors that the problem's functions capture,
-    such as the weights of a module, are read again at each call. What the functions do, Python's numbers in them, and
-    which bounds are infinite stay as they are now: see `Compiled.stale`.
-
-    Args:
-        problem: B problems. Those of a GPU are solved as by `torchgco.solve`; answers lie on the CPU.
-        solver: "gco" or "interior_point": of the first call, and of what no warm start leads to.
-        changes: names of the numbers that calls may change; others keep what the problem has. None: all that
-            `Compiled.numbers` lists.
-        receding: each call's horizon begins a stage after that of the call before; its warm start is shifted as far.
-            Where the time is free, calls say what has `elapsed`.
-        tolerance: of the optimality conditions; None: that of `InteriorPoint`.
-
-    Raises:
-        InputError: another solver, a name that isn't there, a problem of another device that can't be served from the
-            CPU, `receding` in free time.
-    """
-    check_untransformed("compile")
-    problem = current_problem(problem)
-    if solver not in SOLVERS:
-        raise InputError("solver", " or ".join(f'"{name}"' for name in SOLVERS), shown(solver))
-    check_value(receding, bool, "receding")
-    interior = InteriorPoint()
-    if tolerance is not None:
-        interior = replace(interior, tolerance=check_value(tolerance, Positive, "tolerance"))
-    return Compiled(problem, solver, changes, receding, interior)
 
 
 class Compiled:
@@ -110,40 +69,43 @@ class Compiled:
     """
 
     numbers: Numbers
+    _problem: Any
 
     def __init__(
-        self,
-        problem: Problem,
-        solver: str,
-        changes: Sequence[str] | None,
-        receding: bool,
-        interior: InteriorPoint,
+        self, problem: Any, solver: str, changes: Sequence[str] | None, receding: bool, interior: InteriorPoint
     ) -> None:
-        if problem.time is not None and receding:
-            raise InputError("receding", "False where the time is free: calls say what has `elapsed`, s", True)
-        if any(isinstance(part, Integral) for part in problem.constraints):
-            raise InputError("problem", "one without Integral in compiled problems and loops", "Integral")
-        self._given: Problem | None = problem
-        there = held_on_cpu(problem)
-        self.origin, self.solver, self.interior = (problem.x0.device, is_mixed(there)), solver, interior
-        self.receding, self.changes = receding, changes
-        with _plainly():
-            self._begin(with_own_numbers(there))
+        there = problem if problem.x0.device.type == CPU.type else held_on_cpu(problem)
+        self.origin = problem.x0.device, isinstance(there, Problem) and is_mixed(there)
+        self.solver, self.interior, self.receding, self.changes = solver, interior, receding, changes
+        self._given: Any = problem
+        with plainly():
+            self._begin(self._owning(there))
 
-    def _begin(self, problem: Problem) -> None:
-        all_numbers = numbers_of(problem)
-        all_numbers = all_numbers if problem.time is None else numbers_in_time(all_numbers, problem)
+    # What a problem is compiled by; `phases.CompiledPhases` has phases in its place.
+    _owning: ClassVar[Any] = staticmethod(with_own_numbers)
+    _refreshed: ClassVar[Any] = staticmethod(with_numbers_as_they_are)
+    _form: ClassVar[Any] = staticmethod(for_solvers)
+    _guess: ClassVar[Any] = staticmethod(later)
+    _numbers_of: ClassVar[Any] = staticmethod(numbers_of)
+
+    @property
+    def _in_time(self) -> bool:
+        return self._problem.time is not None
+
+    def _begin(self, problem: Any) -> None:
+        self._problem = problem
+        all_numbers = self._numbers_of(problem)
         every = Numbers(all_numbers, self._note)
         chosen = None if self.changes is None else {every.find(name).name for name in self.changes}
         self.numbers = Numbers([n for n in all_numbers if chosen is None or n.name in chosen], self._note)
-        self._problem, self._changed = problem, set[str | int]()
+        self._changed = set[str | int]()
         self._lock = threading.Lock()
         self._warm = np.zeros(problem.B, dtype=bool)  # which problems have an answer to begin with
         self._found: Solution | None = None  # the last answer, where it isn't what C has left
         self._kept: Kept | None = None
         self._pack(problem)
 
-    def _pack(self, problem: Problem) -> None:
+    def _pack(self, problem: Any) -> None:
         """Compile and pack a problem as it is now; what was packed before hands its iterates on."""
         self._unit = torch.ones(problem.B, dtype=problem.x0.dtype)
         before, self._kept = self._kept, None
@@ -152,7 +114,7 @@ class Compiled:
         if self._kept is not None and before is not None:
             self._kept.begin_with(before)
 
-    def _packed(self, problem: Problem) -> None:
+    def _packed(self, problem: Any) -> None:
         if problem.free_start is not None or problem.B == 0:
             return
         if problem.time is not None:
@@ -176,8 +138,9 @@ class Compiled:
         max_seconds: float | None = None,
         numbers: Mapping[str, Any] | None = None,
         **named: Any,
-    ) -> Answer:
-        """Solve with new numbers; those that aren't named keep their values.
+    ) -> Any:
+        """Solve with new numbers; those that aren't named keep their values. Returns an `Answer`, a `PhasesAnswer` of
+        phases.
 
         Args:
             warm: begin with the last answer, where that was a solution.
@@ -203,7 +166,7 @@ class Compiled:
         elapsed: float | None = None,
         max_seconds: float | None = None,
         begin: Begin | None = None,
-    ) -> Answer:
+    ) -> Any:
         """The same, with the new numbers by full names.
 
         Args:
@@ -227,7 +190,7 @@ class Compiled:
 
     def _moved(self, shift: Any, elapsed: Any) -> float:
         """By how much the horizon has moved since the last call: stages, or seconds where the time is free."""
-        free = self._problem.time is not None
+        free = self._in_time
         name, other = ("elapsed", "shift") if free else ("shift", "elapsed")
         moved, wrong = (elapsed, shift) if free else (shift, elapsed)
         if wrong is not None:
@@ -241,11 +204,11 @@ class Compiled:
         return moved
 
     @property
-    def problem(self) -> Problem:
-        """The problem, whose parts hold the numbers as they are."""
+    def problem(self) -> Any:
+        """The problem, or phases, whose parts hold the numbers as they are."""
         return self._problem
 
-    @_plainly()
+    @plainly()
     def solution(self) -> Solution:
         """The last answer with multipliers, costs and statuses; costs of what C solved are by the numbers as they are.
 
@@ -269,7 +232,7 @@ class Compiled:
             self._found = self._packed_solution(self._warm)
         return self._found
 
-    @_plainly()
+    @plainly()
     def stale(self) -> str | None:
         """What the compiled code would compute otherwise if it were compiled now, in a line; None: nothing.
 
@@ -280,7 +243,7 @@ class Compiled:
             return "numbers of the problem were changed in place since it was compiled: pass them to the call by name"
         if self._kept is None:
             return None  # PyTorch's kernels call the functions themselves
-        problem, then = for_solvers(self.now.renewed()), self._kept.engine
+        problem, then = self._form(self.now.renewed()), self._kept.engine
         read = then.captured.read()
         with traced_like(then.captured.traces):
             now = Engine(problem, compiles=False)
@@ -288,7 +251,7 @@ class Compiled:
             return None
         return "the problem's functions, or what they capture, have changed since it was compiled: compile it again"
 
-    @_plainly()
+    @plainly()
     def __getstate__(self) -> dict[str, Any]:
         """A process that loads it compiles again, and begins without an answer."""
         names = "solver", "interior", "receding", "changes", "origin"
@@ -298,11 +261,11 @@ class Compiled:
         problem = state.pop("problem")
         vars(self).update(state)
         self._given = None
-        with _plainly():
-            self._begin(with_own_numbers(problem))
+        with plainly():
+            self._begin(self._owning(problem))
 
     def _note(self, number: Number) -> None:
-        if number.derived or self._problem.time is not None:  # where it is, C has traced what it would read itself
+        if number.derived or self._in_time:  # where it is, C has traced what it would read itself
             self._changed.add(number.part)
 
     def _refresh(self, shift: float = 0) -> None:
@@ -310,8 +273,8 @@ class Compiled:
         kept = self._kept
         assert kept is not None
         parts = self._changed
-        if isinstance(kept, KeptInTime):
-            with _plainly():
+        if isinstance(kept, KeptLifted):
+            with plainly():
                 kept.shift(shift)
                 parts = kept.read(parts, self.now)
         elif shift:
@@ -326,21 +289,21 @@ class Compiled:
         self._changed.clear()
         kept.start()
         if kept.is_outdated:  # C reads what functions capture as it is now
-            with _plainly():
+            with plainly():
                 if not kept.refresh_captured():
                     self._pack(self.now.renewed())
 
     @property
-    def now(self) -> Problem:
+    def now(self) -> Any:
         """The problem with its numbers as they are, and nothing that was computed from others."""
-        return with_numbers_as_they_are(self._problem)
+        return self._refreshed(self._problem)
 
     def _solved(self, able: np.ndarray, shift: float, began: float, until: float, begin: Begin | None) -> Answer:
         if self._kept is not None:
             self._refresh(shift)
         kept = self._kept
         if kept is None:
-            with _plainly():
+            with plainly():
                 self._found = self._by_solver(shift if able.all() else None, until)
                 return self._answer(able & able.all(), began)
         good = late = np.zeros_like(able)
@@ -352,7 +315,7 @@ class Compiled:
             kept.iterations.zero_()
         self._found = None
         if not good.all():
-            with _plainly():
+            with plainly():
                 self._found, again = self._packed_solution(good), torch.from_numpy(~(good | late)).nonzero().flatten()
                 if again.numel() > 0 and begin is not None:
                     again = self._begun(self._found, again, begin, until)
@@ -393,7 +356,7 @@ class Compiled:
         assert kept is not None
         if kept.engine.measures:
             return kept.worst
-        return violation(for_solvers(self.now).constraints, *kept.rolled)
+        return violation(self._form(self.now).constraints, *kept.rolled)
 
     def _packed_solution(self, good: np.ndarray) -> Solution:
         """What C has found; CONVERGED where it is `good` (B,)."""
@@ -414,20 +377,21 @@ class Compiled:
         """Solve the problems `rows` from the start by the solver, into `answer` and what the next call begins with."""
         kept, tried = self._kept, answer.iterations[rows]
         assert kept is not None
-        now = self.now.take(rows)
-        solution = self._by_solver(None, until, now)
+        solution = self._by_solver(None, until, rows)
         bare = replace(solution, trace=None, search=None, account=None, needed=None)
         put(answer, rows, replace(bare, iterations=solution.iterations + tried))
         kept.take_over(rows, solution)
 
-    def _by_solver(self, shift: float | None, until: float, problem: Problem | None = None) -> Solution:
-        """A solve by the solver that `compile` was given, from the last answer where a shift is given."""
-        now = self.now if problem is None else problem
-        solver = self.interior if self.solver == "interior_point" else named("gco", now)
+    def _by_solver(self, shift: float | None, until: float, rows: Tensor | None = None) -> Solution:
+        """A solve of all problems, or some, by the solver that `compile` was given, from the last answer where a shift
+        is given."""
+        now: Any = self.now if rows is None else self.now.take(rows)
         seconds = None if until == math.inf else max(1e-3, until - clock.seconds())
-        warm = None if shift is None or self._last is None else later(now, self._last, shift)
+        warm = None if shift is None or self._last is None else self._guess(now, self._last, shift)
+        solver = self.interior if self.solver == "interior_point" else self.solver
         with served_by(*self.origin):
-            return solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
+            found: Any = solve(now, solver=solver, warm=warm, max_seconds=seconds, verbose=False)
+        return found.found if isinstance(found, PhasesSolution) else found  # type: ignore[no-any-return]
 
     def _answer(self, good: np.ndarray, began: float) -> Answer:
         last, kept = self._found, self._kept
@@ -444,6 +408,6 @@ class Compiled:
         self._warm = (ended == CONVERGED) | (ended == FEASIBLE) | (ended == TIME_LIMIT)
         t = last.times if last is not None else None
         if last is None and isinstance(kept, KeptInTime):
-            with _plainly():
+            with plainly():
                 t = kept.times
         return Answer(X, U, K, status, iterations, worst, torch.from_numpy(good), clock.seconds() - began, t)

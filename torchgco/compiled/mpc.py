@@ -17,13 +17,15 @@ from torchgco.base.options import PositiveOrInfinite, Seconds, Seed, check_value
 from torchgco.base.shapes import CPU, check_shape, check_tensor, check_untransformed, computing_on
 from torchgco.base.status import Status
 from torchgco.compiled.answer import Answer
-from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled, compile
+from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled
+from torchgco.compiled.compiling import compile
 from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbers import Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
 from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, stage_of
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current, held_on_cpu, is_mixed, open_loop, path_clearance, served_by
 from torchgco.lagrangian.lagrangian import shifted
+from torchgco.phases import Phases
 from torchgco.problem.alone import check_rows
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
@@ -84,6 +86,8 @@ class MPC:
         changes: Sequence[str] | None = None,
         tolerance: float | None = None,
     ) -> None:
+        if isinstance(problem, Phases):
+            raise InputError("problem", "a Problem; PhasesMPC takes phases", "Phases")
         asked = current_problem(problem)
         problem = held_on_cpu(asked)
         for name, value in (("horizon", problem.horizon), ("free_start", problem.free_start)):
@@ -227,7 +231,7 @@ class MPC:
             with computing_on(CPU), torch.inference_mode(False):
                 u = self._hold(answer, solved, now, state, known)
         if not solved.all() or bool(answer.violation.any()):
-            u = self._within(u)
+            u = within_bounds(self.compiled.problem, u)
         self.t, self.answer, self._u = now, answer, u
         return u[0].clone() if state.ndim == 1 and len(u) == 1 else u.clone()
 
@@ -264,14 +268,6 @@ class MPC:
         self._plan = plan
         return self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u
 
-    def _within(self, u: Tensor) -> Tensor:
-        """Controls (B, m) within the bounds of the first stage, which a solver's tolerance may exceed."""
-        bounds = self.compiled.problem.control_bounds
-        if bounds is None:
-            return u
-        low, high = bounds.over(self._problem.N)
-        return clamped(u, low[:, 0], high[:, 0])
-
     def _made(self, answer: Answer, now: float | None = None) -> Plan:
         """An answer's plans, from the times that they were made at, or all from now."""
         problem, begun = self.compiled.problem, self._begun if now is None else np.full_like(self._begun, now)
@@ -281,12 +277,35 @@ class MPC:
         )  # fmt: skip
 
     def _time(self, t: float | None) -> float:
-        first = self.answer is None
-        if t is None:
-            return self.t if first else self.t + self.period
-        if isinstance(t, bool) or not isinstance(t, int | float) or not np.isfinite(t) or (not first and t <= self.t):
-            raise InputError("t", "a time in seconds" if first else f"a time after {self.t:g} s", shown(t))
-        return float(t)
+        return time_of(
+            t, None if self.answer is None else self.t, self.t if self.answer is None else self.t + self.period
+        )
+
+
+def within_bounds(problem: Problem, u: Tensor) -> Tensor:
+    """Controls (B, m) within the bounds of the first stage, which a solver's tolerance may exceed."""
+    bounds = problem.control_bounds
+    if bounds is None:
+        return u
+    low, high = bounds.over(problem.N)
+    return clamped(u, low[:, 0], high[:, 0])
+
+
+def time_of(t: Any, before: float | None, otherwise: float) -> float:
+    """When a step is, s: t, or `otherwise` where that isn't given.
+
+    Args:
+        before: time of the last step; None: there was none.
+
+    Raises:
+        InputError: no time, or one that isn't after the last step's.
+    """
+    if t is None:
+        return otherwise
+    late = before is None or (isinstance(t, int | float) and t > before)
+    if isinstance(t, bool) or not isinstance(t, int | float) or not np.isfinite(t) or not late:
+        raise InputError("t", "a time in seconds" if before is None else f"a time after {before:g} s", shown(t))
+    return float(t)
 
 
 class MPPIController:

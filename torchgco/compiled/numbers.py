@@ -22,6 +22,7 @@ from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.problem.goal import Goal, GoalBall, GoalState
 from torchgco.problem.in_time import Elapsed, factors_in, factors_of, in_time, states_in_time, times_of
 from torchgco.problem.problem import Problem
+from torchgco.problem.scale import CostScale
 from torchgco.solution import Solution
 from torchgco.tracing import own_tensors
 
@@ -111,8 +112,8 @@ def _short(name: str) -> str:
 def with_own_numbers(problem: Problem) -> Problem:
     """The same problems, with memory of its own for every number of every problem."""
     B = problem.B
-    parts: dict[str, Any] = {name: _own(getattr(problem, name), B) for name in ("dynamics", "constraints", "time")}
-    parts |= {"x0": problem.x0.clone(), "cost": _own(problem.cost.by_knot(problem.N), B)}
+    parts: dict[str, Any] = {name: owned(getattr(problem, name), B) for name in ("dynamics", "constraints", "time")}
+    parts |= {"x0": problem.x0.clone(), "cost": owned(problem.cost.by_knot(problem.N), B)}
     goal = problem.goal
     if goal is not None and goal.required:
         row = parts["constraints"][-1]
@@ -121,13 +122,18 @@ def with_own_numbers(problem: Problem) -> Problem:
     return problem._with(parts)
 
 
-def numbers_of(problem: Problem) -> list[Number]:
-    """The numbers of a problem that has memory of its own for each, `with_own_numbers`."""
-    collected = [Number("x0", (problem.x0.numpy(),), "x0", False, lambda new: None)]
-    collected += problem.cost.numbers("cost") + numbers_of_fields(problem.dynamics, "dynamics", "dynamics")
+def numbers_of(problem: Problem, where: str = "") -> list[Number]:
+    """The numbers of a problem that has memory of its own for each, `with_own_numbers`; of its time, too.
+
+    Args:
+        where: the problem is, before the numbers' names.
+    """
+    collected = [Number(f"{where}x0", (problem.x0.numpy(),), "x0", False, lambda new: None)]
+    collected += problem.cost.numbers(f"{where}cost")
+    collected += numbers_of_fields(problem.dynamics, f"{where}dynamics", "dynamics")
     for i, constraint in enumerate(problem.constraints):
-        collected += constraint.numbers(f"constraints[{i}]", i)
-    return collected
+        collected += constraint.numbers(f"{where}constraints[{i}]", i)
+    return collected if problem.time is None else _numbers_in_time(collected, problem, where)
 
 
 def with_numbers_as_they_are(problem: Problem) -> Problem:
@@ -141,7 +147,7 @@ def with_numbers_as_they_are(problem: Problem) -> Problem:
     return now
 
 
-def _own(part: Any, B: int) -> Any:
+def owned(part: Any, B: int) -> Any:
     """A part of a problem with copies of all its numbers, one for every problem."""
 
     def each(value: Tensor) -> Tensor:
@@ -152,7 +158,34 @@ def _own(part: Any, B: int) -> Any:
     return own_mapped(part, each)
 
 
-class KeptInTime(Kept):
+class KeptLifted(Kept):
+    """Kept problems in a form whose first states are the user's, then, where the time is free, its first factor."""
+
+    def __init__(
+        self, kernels: InteriorEngine, problem: Problem, scale: CostScale, options: BarrierOptions, user: Problem
+    ) -> None:
+        super().__init__(kernels, problem, scale, options)
+        self._given, self._frees = user.x0.numpy(), user.time is not None
+
+    def start(self) -> None:
+        """See `Kept`; the factor of time stays as it is."""
+        n, first = self._given.shape[1], self._moving[0][:, 0]
+        self._x0[:, :n] = first[:, :n] = self._given
+        first[:, n + self._frees :] = self._x0[:, n + self._frees :]
+
+    def read(self, changed: set[str | int], now: Any) -> set[str | int]:
+        """Put numbers of the user's parts that have changed where the form has copies of them.
+
+        Args:
+            now: what the user has given, with its numbers as they are.
+
+        Returns:
+            the parts whose numbers C has to read again.
+        """
+        raise NotImplementedError
+
+
+class KeptInTime(KeptLifted):
     """Kept problems with a free time: in the form `in_time` and, as in solves with a choice of time, in units of cost.
 
     Args:
@@ -164,8 +197,7 @@ class KeptInTime(Kept):
 
     def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
         self.user, self.whole, self.unit = user, whole, cost_unit(whole)
-        super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options)
-        self._given = user.x0.numpy()
+        super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options, user)
         pairs = zip(user.constraints, whole.constraints, strict=False)
         self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}
 
@@ -183,12 +215,6 @@ class KeptInTime(Kept):
         """See `Kept`: those of the user's states and controls."""
         (X, U, K, status, iterations), n, m = super().copies(), self.user.n, self.user.m
         return X[..., :n].contiguous(), U[..., :m].contiguous(), K[..., :m, :n].contiguous(), status, iterations
-
-    def start(self) -> None:
-        """See `Kept`; the factors of time stay as they are."""
-        n, first = self.user.n, self._moving[0][:, 0]
-        self._x0[:, :n] = first[:, :n] = self._given
-        first[:, n + 1 :] = self._x0[:, n + 1 :]
 
     def shift(self, by: float) -> None:
         """Let all trajectories and multipliers begin `by` seconds later; see `Elapsed`."""
@@ -214,25 +240,18 @@ class KeptInTime(Kept):
             lam[rows] = solved
 
     def read(self, changed: set[str | int], now: Problem) -> set[str | int]:
-        """Put numbers of the user's parts that have changed where the form `in_time` has copies of them.
-
-        Args:
-            now: the user's problems with their numbers as they are.
-
-        Returns:
-            the parts whose numbers C has to read again.
-        """
+        """See `KeptLifted`."""
         places = sorted(self._copied_parts.intersection(changed))
         if not places and "time" not in changed:
             return changed
         new, n = in_time(now), self.user.n
         self._x0[:, n + 1 :] = new.x0[:, n + 1 :].numpy()  # controls before
         if "time" in changed:
-            _copy(self.whole.cost, new.cost)
+            overwrite(self.whole.cost, new.cost)
             places += range(len(self.user.constraints), len(new.constraints))
             changed = changed.union({"cost"}, places)
         for i in places:
-            _copy(self.whole.constraints[i], new.constraints[i])
+            overwrite(self.whole.constraints[i], new.constraints[i])
         return changed
 
 
@@ -249,13 +268,13 @@ def kept_in_time(problem: Problem, options: BarrierOptions) -> KeptInTime | None
     return KeptInTime(kernels, problem, whole, options)
 
 
-def numbers_in_time(by_problem: list[Number], problem: Problem) -> list[Number]:
+def _numbers_in_time(by_problem: list[Number], problem: Problem, where: str) -> list[Number]:
     """The numbers of a problem with a free time: those of the problem, of the time, and checks of what is by stage."""
     time = problem.time
     assert time is not None
     by_stage = problem.cost.names_by_stage()
     for number in by_problem:
-        if number.part == "cost" and number.name.rpartition(".")[2] in by_stage:
+        if number.part == f"{where}cost" and number.name.rpartition(".")[2] in by_stage:
             number.check = partial(_steady, number, problem.N, number.check)
     tensors = {name: getattr(time, name) for name in ("least", "most", "weight", "guess")}
     fields = {
@@ -264,7 +283,7 @@ def numbers_in_time(by_problem: list[Number], problem: Problem) -> list[Number]:
         if tensor is not None
     }
     views = {name: tensor.numpy() for name, (tensor, _) in fields.items()}
-    return by_problem + numbers("time", fields, "time", joint=partial(_crossed, views))
+    return by_problem + numbers(f"{where}time", fields, "time", joint=partial(_crossed, views, f"{where}time"))
 
 
 def later(problem: Problem, last: Solution, shift: float) -> Solution:
@@ -292,7 +311,7 @@ def _differ(users: Any, lifted: Any) -> bool:
     return any(tensor.data_ptr() not in there for tensor in own_tensors(users))
 
 
-def _copy(old: Any, new: Any) -> None:
+def overwrite(old: Any, new: Any) -> None:
     for there, here in zip(own_tensors(old), own_tensors(new), strict=True):
         if there.data_ptr() != here.data_ptr():
             there.copy_(here)
@@ -306,10 +325,13 @@ def _steady(number: Number, N: int, check: Any, new: Floats) -> Wrong:
     return check(new)  # type: ignore[no-any-return]
 
 
-def _crossed(views: dict[str, Floats], new: Any) -> Wrong:
-    times = {name: new.get(f"time.{name}", view) for name, view in views.items()}
+def _crossed(views: dict[str, Floats], where: str, new: Any) -> Wrong:
+    times = {name: new.get(f"{where}.{name}", view) for name, view in views.items()}
     inner: Sequence[Floats] = [times["guess"]] if "guess" in times else []
     for low, high in zip([times["least"], *inner], [*inner, times["most"]], strict=True):
         if (low > high).any():
-            return "time.least at most time.guess and time.most", f"{low[low > high][0]:g} and {high[low > high][0]:g}"
+            return (
+                f"{where}.least at most {where}.guess and {where}.most",
+                f"{low[low > high][0]:g} and {high[low > high][0]:g}",
+            )
     return None

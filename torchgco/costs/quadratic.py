@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -214,13 +215,13 @@ class BoundQuadratic(Cost):
             tensor = getattr(self, name)
             if tensor is not None:
                 check = finite if name not in WEIGHTS else at_least_zero if self.diagonal else _matrices
-                joint = self._check_new if name in ("Q", "R", "H") and self.H is not None else None
+                joint = partial(self._check_new, where) if name in ("Q", "R", "H") and self.H is not None else None
                 entries += numbers(where, {name: (tensor, check)}, where, False, joint=joint)
         return entries
 
-    def _check_new(self, new: Mapping[str, Floats]) -> None:
+    def _check_new(self, where: str, new: Mapping[str, Floats]) -> None:
         """Check Q, R and H together: each alone may be fine, and the stage cost still fall without end."""
-        matrices = {name: new.get(f"cost.{name}", getattr(self, name).numpy()) for name in (*WEIGHTS, "H")}
+        matrices = {name: new.get(f"{where}.{name}", getattr(self, name).numpy()) for name in (*WEIGHTS, "H")}
         check_semidefinite(**{name: torch.tensor(weights) for name, weights in matrices.items()})
 
     def by_knot(self, N: int) -> BoundQuadratic:

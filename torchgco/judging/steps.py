@@ -109,7 +109,7 @@ def step_errors(
             if chosen.numel() > 0:
                 numbers = chosen + rows.start
                 parts = X[numbers], U[numbers], e[chosen], None if times is None else times[numbers]
-                costs[chosen] = _cost_of(
+                costs[chosen] = cost_of(
                     problem.take(numbers), *parts, [lam[numbers] for lam in multipliers or ()], costates
                 )
             error.step_cost[rows] = costs
@@ -117,6 +117,11 @@ def step_errors(
         costs = error.step_cost > too_much
         error.large[:], error.of_cost[:] = large | costs, costs & ~large & (order == 1)
     return error
+
+
+def differences(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> Tensor | None:
+    """Each state minus what two steps of half the length lead to, (B, N, n); None without a known field."""
+    return _along(problem, X, U, times)[0] if _halves(problem) else None
 
 
 def _halves(problem: Problem) -> bool:
@@ -154,14 +159,14 @@ def _along(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> tupl
     return e, torch.where(apart > 0, apart / ranges, apart)
 
 
-def _cost_of(
+def cost_of(
     problem: Problem,
     X: Tensor,
     U: Tensor,
     e: Tensor,
     times: Tensor | None,
     multipliers: Sequence[Tensor],
-    costates: Costates | None,
+    costates: Costates | None = None,
 ) -> Tensor:
     """`StepErrors.step_cost` (B,) of the differences e (B, N, n)."""
     found = None if costates is None else costates(problem, X, U, multipliers)

@@ -1,6 +1,6 @@
 """Phases: problems one after the other, each with its own model, and jumps between them."""
 
 from torchgco.phases.phases import Jump, Phases
-from torchgco.phases.solution import PhasesSolution
+from torchgco.phases.solution import OfPhases, PhasesSolution
 
-__all__ = ["Jump", "Phases", "PhasesSolution"]
+__all__ = ["Jump", "OfPhases", "Phases", "PhasesSolution"]

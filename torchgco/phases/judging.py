@@ -115,7 +115,7 @@ def certify(
 
     Args:
         problem: the planning problems; those in float32 are certified in float64, with their numbers as they are. Or
-            phases, of whose step costs nothing is said.
+            phases, of whose steps in all the largest error counts, and by how much they change the cost of all.
         X, U: the trajectories that a solver returned, float64 or float32; of phases their solution alone, with whose
             multipliers they are tested.
         asked: (B,) bool, the problems to certify; NaN for the others. None: all.

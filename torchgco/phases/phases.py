@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from operator import is_
@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, first_line, shown
 from torchgco.base.gradients import asking, is_recording, recording, without_gradients
 from torchgco.base.options import Natural, check_value
 from torchgco.base.shapes import MISTAKES, Dimensions, describe
-from torchgco.base.tree import PerElement
+from torchgco.base.tree import PerElement, Rows
 from torchgco.base.values import NO_VALUES, Values, bound_values
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.link import Link
@@ -205,6 +205,27 @@ class Phases:
     def B(self) -> int:
         """How many problems of phases."""
         return self.members[0].B
+
+    @property
+    def x0(self) -> Tensor:
+        """The starts (B, n) of the first phase."""
+        return self.members[0].x0
+
+    def of_parts(self, members: Iterable[Problem], between: Iterable[Jump]) -> Phases:
+        """Phases of other problems and jumps, which are checked and bound already."""
+        made = copy(self)
+        parts: dict[str, Any] = {"members": tuple(members), "between": tuple(between), "derived": {}}
+        for name, value in parts.items():
+            object.__setattr__(made, name, value)
+        return made
+
+    def take(self, index: Rows) -> Phases:
+        """The phases of the problems in `index` (int64, (b,), or a slice)."""
+        return self.of_parts([one.take(index) for one in self.members], [jump.take(index) for jump in self.between])
+
+    def renewed(self) -> Phases:
+        """The same, with nothing kept that was computed from their parts."""
+        return self.of_parts([one.renewed() for one in self.members], self.between)
 
     def current(self) -> Phases:
         """The same phases with numbers as they are now, where these were changed in place since; else these."""

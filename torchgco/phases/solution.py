@@ -20,7 +20,7 @@ from torchgco.constraints.base import ADMITTED
 from torchgco.explaining.explain import Account
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.judge import Verdict, doubled, in_double, judge
-from torchgco.judging.steps import Costates
+from torchgco.judging.steps import Costates, cost_of, differences
 from torchgco.kernels import costates, current
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
@@ -36,8 +36,66 @@ from torchgco.solvers.ending import judged_between
 from torchgco.warned import warn_of
 
 
+class OfPhases:
+    """What solutions and answers of phases share: one for each phase, in its own states and controls."""
+
+    whole: Whole
+    found: Any  # of the problem that solvers were given, with X, U and K
+
+    def _part(self, i: int) -> Any:
+        raise NotImplementedError
+
+    @property
+    def phases(self) -> Phases:
+        return self.whole.phases
+
+    @cached_property
+    def parts(self) -> tuple[Any, ...]:
+        """Those of the phases."""
+        return tuple(self._part(i) for i in range(len(self)))
+
+    @cached_property
+    def jumps(self) -> tuple[Tensor, ...]:
+        """The controls (B, m) of each jump."""
+        spans = zip(self.whole.spans_between, self.phases.between, strict=True)
+        return tuple(self.found.U[:, span.first, : jump.controls].contiguous() for span, jump in spans)
+
+    def _trajectory(self, i: int) -> tuple[Tensor, Tensor, Tensor]:
+        """States and controls of phase i in the form of solvers, and its own gains."""
+        span, member = self.whole.spans[i], self.whole.members[i]
+        gains = self.found.K[:, span.stages, : member.m, : member.n].contiguous()
+        return *span.own(self.found.X, self.found.U), gains
+
+    @property
+    def begins(self) -> Tensor:
+        """When each phase begins, and the last one ends, (B, P+1), s.
+
+        Raises:
+            InputError: a model without a time step.
+        """
+        each = [one.duration for one in self.parts]
+        if any(length is None for length in each):
+            raise InputError("phases", "models with a time step", "one without")
+        lengths = torch.stack(each, dim=-1)
+        return torch.cat((torch.zeros_like(lengths[:, :1]), lengths.cumsum(-1)), dim=-1)
+
+    @property
+    def duration(self) -> Tensor:
+        """How long all phases last, (B,), s."""
+        return self.begins[:, -1]
+
+    def __len__(self) -> int:
+        return len(self.phases)
+
+    def __getitem__(self, i: int) -> Any:
+        return self.parts[i]
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.parts)
+
+
 @dataclass(frozen=True)
-class PhasesSolution:
+class PhasesSolution(OfPhases):
     """A `Solution` for each phase, in its own states and controls, and how all of them ended. It has their number.
 
     Cost, violation and times of `solution[i]` are those of phase i, which begins at 0 s; `begins` says when it does.
@@ -53,15 +111,6 @@ class PhasesSolution:
         "found", "cost", "violation", "status", "iterations", "statuses", "differentiable", "why_not"
     )  # (B,) of all phases and jumps: the sum, the largest, metres for lengths, see Status
 
-    @property
-    def phases(self) -> Phases:
-        return self.whole.phases
-
-    @cached_property
-    def parts(self) -> tuple[Solution, ...]:
-        """The solutions of the phases."""
-        return tuple(self._part(i) for i in range(len(self)))
-
     @cached_property
     def problems(self) -> tuple[Problem, ...]:
         """The phases' problems, each with its start that was found: for `plot`, `certify` and tables of one."""
@@ -71,23 +120,17 @@ class PhasesSolution:
         pairs = zip(others, starts, strict=True)
         return first, *(one._with({"x0": x[:, : one.n].contiguous()}, one.known) for one, x in pairs)
 
-    @cached_property
-    def jumps(self) -> tuple[Tensor, ...]:
-        """The controls (B, m) of each jump."""
-        spans = zip(self.whole.spans_between, self.phases.between, strict=True)
-        return tuple(self.found.U[:, span.first, : jump.controls].contiguous() for span, jump in spans)
-
     def _part(self, i: int) -> Solution:
         whole, found = self.whole, self.found
         member, form, span = whole.members[i], whole.forms[i], whole.spans[i]
-        X, U = span.own(found.X, found.U)
+        X, U, K = self._trajectory(i)
         first, n, m = sum(len(one.constraints) for one in whole.forms[:i]), member.n, member.m
         lam = tuple(found.multipliers.lam[first : first + len(member.constraints)])
         times = None if member.time is None else times_of(member, factors_in(member, X))
         worst = violation(form.constraints, X.detach(), U.detach())
         return replace(
             found, X=X[..., :n].contiguous(), U=U[..., :m].contiguous(), cost=self._cost(i, X, U),
-            K=found.K[:, span.stages, :m, :n].contiguous(), d=found.d[:, span.stages, :m].contiguous(),
+            K=K, d=found.d[:, span.stages, :m].contiguous(),
             multipliers=Multipliers(lam, found.multipliers.mu), violation=worst,
             times=times, trace=None, search=None,
             account=Account(self.problems[i], self.solver, kernels=found.account and found.account.kernels),
@@ -110,30 +153,6 @@ class PhasesSolution:
     def detach(self) -> PhasesSolution:
         """The same numbers without gradients."""
         return replace(self, found=self.found.detach(), live=None)
-
-    def __len__(self) -> int:
-        return len(self.phases)
-
-    def __getitem__(self, i: int) -> Solution:
-        return self.parts[i]
-
-    def __iter__(self) -> Iterator[Solution]:
-        return iter(self.parts)
-
-    @property
-    def begins(self) -> Tensor:
-        """When each phase begins, and the last one ends, (B, P+1), s.
-
-        Raises:
-            InputError: a model without a time step.
-        """
-        lengths = torch.stack([one.duration for one in self.parts], dim=-1)
-        return torch.cat((torch.zeros_like(lengths[:, :1]), lengths.cumsum(-1)), dim=-1)
-
-    @property
-    def duration(self) -> Tensor:
-        """How long all phases last, (B,), s."""
-        return self.begins[:, -1]
 
     def __repr__(self) -> str:
         ended = ", ".join(f"{count} {Status(s).name}" for s, count in Counter(self.status.tolist()).items())
@@ -195,8 +214,9 @@ def certify_phases(phases: Phases, solution: Any, asked: Tensor | None) -> Certi
     """
     _check(phases, solution)
     phases, found = phases.current(), solution.found.detach()
-    whole = certify(Whole(phases).problem, found.X, found.U, asked, found.multipliers.lam)
-    each = []
+    lowered = Whole(phases)
+    whole = certify(lowered.problem, found.X, found.U, asked, found.multipliers.lam)
+    each = list[Certificate]()
     for member, part in zip(phases.members, solution.detach(), strict=True):
         here = member._with({"x0": part.X[:, 0].to(member.x0.dtype)}, member.known)
         each.append(certify(here, part.X, part.U, asked, part.multipliers.lam, part.times))
@@ -204,7 +224,27 @@ def certify_phases(phases: Phases, solution: Any, asked: Tensor | None) -> Certi
     return replace(
         whole, clearance=reduce(least, (one.clearance for one in each)),
         step_error=reduce(most, (one.step_error for one in each)),
+        step_cost=_step_cost(lowered, solution.detach(), whole),
     )  # fmt: skip
+
+
+def _step_cost(whole: Whole, solution: Any, certificate: Certificate) -> Tensor:
+    """By how much the steps of all phases change the cost of all, as of `StepErrors`; NaN where nothing is certified,
+    or no phase has a known field."""
+    costs, none = torch.full_like(certificate.dynamics_residual, torch.nan), True
+    rows, found = (~certificate.dynamics_residual.isnan()).nonzero().flatten(), solution.found
+    problem = in_double(whole.problem.take(rows))
+    X, U = (z[rows].double() for z in (found.X, found.U))
+    e = X.new_zeros(len(rows), problem.N, problem.n)
+    for member, part, span in zip(whole.members, solution, whole.spans, strict=True):
+        times = None if part.times is None else part.times[rows].double()
+        own = part.X[rows].double(), part.U[rows].double()
+        of_phase = differences(in_double(member.take(rows)), *own, times)
+        if of_phase is not None:
+            e[:, span.stages, : member.n], none = of_phase, False
+    if len(rows) and not none:
+        costs[rows] = cost_of(problem, X, U, e, None, [lam[rows].double() for lam in found.multipliers.lam])
+    return costs
 
 
 def _check(phases: Phases, solution: Any) -> None:

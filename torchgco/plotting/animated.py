@@ -17,13 +17,12 @@ from matplotlib.patches import Circle, Polygon
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.animation import PALE
-from torchgco.plotting.bodies import ABOVE, SIDE, Plane, silhouettes
+from torchgco.plotting.bodies import Plane, silhouettes
 from torchgco.plotting.layouts import ROCK
-from torchgco.plotting.problems import WIDTH, Course, SceneMap, courses_of, is_shared
+from torchgco.plotting.problems import WIDTH, Course, Leg, SceneMap, in_one_box, is_shared
 from torchgco.plotting.scene import World, distances
 from torchgco.plotting.style import INK, TITLE
-from torchgco.problem.in_time import paced
-from torchgco.problem.problem import Problem, current_problem
+from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 
 FPS = 20
@@ -47,25 +46,27 @@ class Film(FuncAnimation):
 
 def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) -> Film:
     """The film of `torchgco.animate`; see there."""
-    problem = current_problem(problem)
-    courses, unit = courses_of(problem, solution, b)
-    position = problem.dynamics.position
-    planes = {2: (ABOVE,), 3: (ABOVE, SIDE)}.get(0 if position is None else position.stop - position.start)
-    if planes is None:
-        raise InputError("problem", "dynamics with a position in 2-D or 3-D", type(problem.dynamics).__name__)
-    if not is_shared(problem, courses):
-        raise InputError("b", "problems among the same obstacles", b)
-    scene = SceneMap.of(paced(problem, solution.times), courses, planes)
-    figure = Figure(figsize=(WIDTH, scene.height(WIDTH) + 0.4), layout="constrained")
+    return film_of([Leg.of(problem, solution, b)], b)
+
+
+def film_of(legs: Sequence[Leg], b: int | Sequence[int]) -> Film:
+    """The film of all legs, one after the other, each among its own obstacles.
+
+    Raises:
+        InputError: see `torchgco.animate`.
+    """
+    scenes = _scenes_of(legs, b)
+    figure = Figure(figsize=(WIDTH, scenes[0].height(WIDTH) + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
-    _at_rest(scene).draw(figure)
-    last = max(float(course.t[-1]) for course in courses)
+    axes = scenes[0].axes(figure)
+    standing = [_standing(scene, axes) for scene in scenes]
+    last = max(float(course.t[-1]) for course in legs[-1].courses)
     times = np.linspace(0.0, last, min(MAX_FRAMES, max(2, round(FPS * last) + 1)))
-    for ax in figure.axes[1:]:
+    for ax in axes[1:]:
         ax.set_title(
-            f"from the side, what is at rest cut where problem {courses[0].b} flies", fontsize=TITLE, loc="left"
+            f"from the side, what is at rest cut where problem {legs[0].courses[0].b} flies", fontsize=TITLE, loc="left"
         )
-    title = figure.axes[0].set_title("Mg", fontsize=TITLE, loc="left", color=INK)
+    title = axes[0].set_title("Mg", fontsize=TITLE, loc="left", color=INK)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # the axes stay where they are
     shown = list[Artist]()
@@ -73,15 +74,47 @@ def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) 
     def show(t: float) -> list[Artist]:
         while shown:
             shown.pop().remove()
-        title.set_text(f"{t:.1f} s" if unit != "knot" else f"knot {t:.1f}")
-        nominal = scene.world.first.dt * float(np.interp(t, courses[0].t, np.arange(len(courses[0].t))))
-        for ax, plane in zip(figure.axes, planes, strict=True):
-            shown.extend(_moving(ax, scene.world, plane, nominal))
-            for course in courses:
-                shown.extend(_vehicle(ax, scene.world, course, plane, t))
+        present = _present(legs, 0, t)
+        now = f"{t:.1f} s" if legs[0].unit != "knot" else f"knot {t:.1f}"
+        title.set_text(now if len(legs) == 1 else f"{now}, phase {present + 1} of {len(legs)}")
+        for i, artists in enumerate(standing):
+            for artist in artists:
+                artist.set_visible(i == present)
+        leading, world = legs[present].courses[0], scenes[present].world
+        nominal = world.first.dt * float(np.interp(t, leading.t, np.arange(len(leading.t))))
+        for ax, plane in zip(axes, scenes[0].planes, strict=True):
+            shown.extend(_moving(ax, world, plane, nominal))
+            for place in range(len(legs[0].courses)):
+                at = _present(legs, place, t)
+                for i in range(at + 1):
+                    shown.extend(_vehicle(ax, scenes[i].world, legs[i].courses[place], plane, t, i == at))
         return shown
 
     return Film(figure, show, times)
+
+
+def _scenes_of(legs: Sequence[Leg], b: int | Sequence[int]) -> list[SceneMap]:
+    """A scene for each leg, all of one extent."""
+    planes = legs[0].planes
+    for leg in legs:
+        if not planes or leg.planes != planes:
+            expected = "dynamics with a position in 2-D or 3-D" + (", of all phases the same" if len(legs) > 1 else "")
+            raise InputError("problem", expected, type(leg.problem.dynamics).__name__)
+        if not is_shared(leg.problem, leg.courses):
+            raise InputError("b", "problems among the same obstacles", b)
+    return in_one_box([SceneMap.of(leg.problem, leg.courses, planes) for leg in legs])
+
+
+def _present(legs: Sequence[Leg], place: int, t: float) -> int:
+    """Which leg a problem's trajectory is in at t."""
+    return max([i for i, leg in enumerate(legs) if leg.courses[place].t[0] <= t], default=0)
+
+
+def _standing(scene: SceneMap, axes: Sequence[Axes]) -> list[Artist]:
+    """Draw what is at rest in a scene; what was drawn."""
+    known = {artist for ax in axes for artist in ax.get_children()}
+    _at_rest(scene).draw_into(axes)
+    return [artist for ax in axes for artist in ax.get_children() if artist not in known]
 
 
 def _at_rest(scene: SceneMap) -> SceneMap:
@@ -109,17 +142,17 @@ def _moving(ax: Axes, world: World, plane: Plane, t: float) -> list[Artist]:
     return drawn
 
 
-def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float) -> list[Artist]:
-    """A trajectory up to t, s, and the vehicle there: its body, or a ball of its radius."""
+def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float, is_there: bool) -> list[Artist]:
+    """A trajectory up to t, s, and the vehicle, where it is there: its body, or a ball of its radius."""
     past, drawn = course.t <= t, list[Artist]()
     for path in course.paths:
         now = np.array([np.interp(t, course.t, path[:, i]) for i in plane])
         way = np.concatenate((path[past][:, plane], now[None]))
         drawn += ax.plot(*way.T, color=course.colour, linewidth=1.4, zorder=7)
-        if world.body is None:
+        if world.body is None and is_there:
             radius = world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
             drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
-    if world.body is not None:
+    if world.body is not None and is_there:
         state = np.array([[np.interp(t, course.t, component) for component in course.X.T]])
         if not np.isfinite(state).all():
             return drawn

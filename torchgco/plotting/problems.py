@@ -96,10 +96,10 @@ def solution_figure(problem: Problem, solution: Solution, b: int | Sequence[int]
     return figure_of([Leg.of(problem, solution, b)])
 
 
-def phases_figure(
+def legs_of(
     problems: Sequence[Problem], solutions: Sequence[Solution], begins: np.ndarray, costs: np.ndarray, b: Any
-) -> Figure:
-    """The same of phases, one after the other.
+) -> list[Leg]:
+    """Phases, one after the other.
 
     Args:
         problems, solutions: of each phase.
@@ -110,7 +110,7 @@ def phases_figure(
     told = enumerate(zip(statuses, costs, strict=True))
     labels = [f"problem {i}: {status.name}, cost {cost:.6g}" for i, (status, cost) in told]
     pairs = enumerate(zip(problems, solutions, strict=True))
-    return figure_of([Leg.of(*pair, b).after(begins[:, i], labels) for i, pair in pairs])
+    return [Leg.of(*pair, b).after(begins[:, i], labels) for i, pair in pairs]
 
 
 def figure_of(legs: Sequence[Leg]) -> Figure:
@@ -151,10 +151,15 @@ def _scenes(legs: Sequence[Leg]) -> list[list[SceneMap]]:
     scenes = []
     for group in [places] if shared else [[i] for i in places]:
         maps = [SceneMap.of(leg.problem, [leg.courses[i] for i in group], planes) for leg in legs]
-        corners = np.stack([one.box for one in maps])
-        box = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
-        scenes.append([replace(one, box=box) for one in maps])
+        scenes.append(in_one_box(maps))
     return scenes
+
+
+def in_one_box(maps: Sequence[SceneMap]) -> list[SceneMap]:
+    """The same scenes, all with the extent of all."""
+    corners = np.stack([one.box for one in maps])
+    box = np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+    return [replace(one, box=box) for one in maps]
 
 
 def _places(b: Any, B: int) -> list[int]:

@@ -22,9 +22,39 @@ from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST_HALF, Packing, number
 from torchgco.view.sensed import Sensed
 from torchgco.view.shapes import Shapes, shapes_of, unknown_of
-from torchgco.view.vehicles import Look, Shape, shape_of, turned
+from torchgco.view.vehicles import Look, Shape, look_of, shape_of, turned
 
 Rows = list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class ShownPhase:
+    """A phase of a layout whose vehicle, stages and obstacles are each phase's own.
+
+    Args:
+        problem: of the phase.
+        first: its first knot among those of all phases, of which two are at the time of a jump.
+    """
+
+    problem: Problem
+    first: int
+
+    def packed(self) -> dict[str, Any]:
+        """As the page reads it: its stages, s, and its vehicle."""
+        shape, dt = shape_of(self.problem), getattr(self.problem.dynamics, "dt", None) or 1.0
+        return {
+            "first": self.first, "stages": self.problem.N, "dt": number(dt),
+            "body": look_of(self.problem.dynamics).body, "radius": number(radius_of(self.problem)),
+            "shape": None if shape is None else shape.packed(),
+        }  # fmt: skip
+
+
+def radius_of(problem: Problem, otherwise: float = 0.0) -> float:
+    """The radius of a vehicle, m: its body's reach, else that with which its obstacles count."""
+    shape = shape_of(problem)
+    if shape is not None:
+        return shape.reach
+    return max((float(obstacles.vehicle_radius.max()) for obstacles in problem.obstacles), default=otherwise)
 
 
 @dataclass(frozen=True)
@@ -43,6 +73,7 @@ class ShownFlight:
         plan: (K, P, d) what the vehicle planned at each knot, of missions; None: nothing.
         notes: one text per knot for the hover, of missions; none: nothing to say.
         sensed: what the vehicle saw and sought, of missions with a sensor.
+        phase: which of several phases it is one of; None: there is but one.
     """
 
     solver: str
@@ -56,6 +87,7 @@ class ShownFlight:
     plan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
     sensed: Sensed | None = None
+    phase: ShownPhase | None = None
 
     def until(self, last: int) -> ShownFlight:
         """The same up to a knot."""
@@ -79,6 +111,8 @@ class ShownFlight:
             entry["plan"] = packing.put(np.nan_to_num(self.plan), steps=True)
         if self.sensed is not None:
             entry["sensed"] = self.sensed.until(len(self.path)).packed(packing, self.path[:, 2])
+        if self.phase is not None:
+            entry["phase"] = self.phase.packed()
         return entry
 
 
@@ -188,10 +222,9 @@ class Document:
     @classmethod
     def of(cls, problem: Problem, radius: float = 0.0, **given: Any) -> Document:
         """The page of a batch of problems, whose vehicle has a `radius`, m, where there are no obstacles."""
-        shape, position = shape_of(problem), problem.position
-        radius = max((float(obstacles.vehicle_radius.max()) for obstacles in problem.obstacles), default=radius)
+        position = problem.position
         names = [kind_of(constraint) for constraint in problem.constraints]
-        size = {"radius": radius if shape is None else shape.reach, "shape": shape}
+        size = {"radius": radius_of(problem, radius), "shape": shape_of(problem)}
         return cls(dimension=position.stop - position.start, constraints=names, **size, **given)  # type: ignore[arg-type]
 
     def add(
@@ -202,24 +235,31 @@ class Document:
         flights: Sequence[ShownFlight],
         search: SearchPart | None = None,
         times: np.ndarray | None = None,
+        phases: Sequence[Problem] = (),
     ) -> None:
         """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any.
 
         Args:
             times: (N+1,) of the knots, s; None: multiples of `dt`.
+            phases: the problem of each of several phases, of which `problem` is the first one.
         """
-        packing, position = Packing(), problem.position
+        packing, position, members = Packing(), problem.position, phases or [problem]
+        last = members[-1]
         start = problem.x0[b, position].detach().cpu().double().numpy()
-        goal = None if problem.goal is None else problem.goal.position[b].cpu().double().numpy()
+        goal = None if last.goal is None else last.goal.position[b].cpu().double().numpy()
         middle = start if goal is None else 0.5 * (start + goal)
         names = list(self.solvers)
         knots = max([problem.N, *(len(flight.path) - 1 for flight in flights)])
         duration = knots * self.dt if times is None else float(times[-1])
         content: dict[str, Any] = {
             "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
-            "goal_radius": None if problem.goal is None else number(problem.goal.radius[b]),
-            "map": _extent(problem, b), "gates": outlines_of(problem, b),
-            "obstacles": [self._placed(packing, one, middle) for one in self._shapes(problem.obstacles, b, duration)],
+            "goal_radius": None if last.goal is None else number(last.goal.radius[b]),
+            "map": next((map_ for one in members if (map_ := _extent(one, b)) is not None), None),
+            "gates": [gate for one in members for gate in outlines_of(one, b)],
+            "obstacles": [
+                self._placed(packing, shapes, middle) | ({"phase": i} if phases else {})
+                for i, one in enumerate(members) for shapes in self._shapes(one.obstacles, b, duration)
+            ],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
             "times": None if times is None else packing.put(times, steps=True),

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from torchgco.base.errors import InputError
 from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
+from torchgco.judging.worst import kind_of
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
-from torchgco.view.document import Document, Rows, flights_of
+from torchgco.view.document import Document, Rows, ShownFlight, ShownPhase, flights_of, radius_of
 from torchgco.view.page import page
 from torchgco.view.searches import search_of
-from torchgco.view.vehicles import look_of
+from torchgco.view.vehicles import look_of, shape_of
 
 
 def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPage:
@@ -27,17 +29,7 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         InputError: a problem of another form, an empty one, or dynamics without a position in the plane or in space.
     """
     problem = current_problem(problem)
-    check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
-    check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
-    dimension = problem.position.stop - problem.position.start
-    if dimension not in (2, 3):
-        raise InputError("dynamics.position", "a position in the plane or in space", f"{dimension} states")
-    if problem.B == 0:
-        raise InputError("problem", "at least one problem to show", "an empty batch")
-    look, rows, results, touching = look_of(problem.dynamics), *_told(problem, solution)
-    flights = flights_of(
-        paced(problem, solution.times), look, solution.X, solution.U, name, results, rows, ADMITTED, touching
-    )
+    flights, look = _flights(problem, solution, name), look_of(problem.dynamics)
     t_of, dt = _times(problem, solution)
     N = problem.N
     about = f"{problem.B} problems, {N} stages" if problem.B > 1 else f"{N} stages"
@@ -47,6 +39,55 @@ def show(problem: Problem, solution: Solution, name: str = "solution") -> HtmlPa
         t = None if t_of is None else t_of[b, : last + 1]
         document.add(f"problem {b}", problem, b, [flight.until(last)], search_of(solution, problem, b), t)
     return HtmlPage(page(document), "Trajectories among obstacles")
+
+
+def _flights(problem: Problem, solution: Solution, name: str) -> list[ShownFlight]:
+    check_shape(solution.X, (problem.B, problem.N + 1, problem.n), "problem: solution.X")
+    check_shape(solution.U, (problem.B, problem.N, problem.m), "problem: solution.U")
+    dimension = problem.position.stop - problem.position.start
+    if dimension not in (2, 3):
+        raise InputError("dynamics.position", "a position in the plane or in space", f"{dimension} states")
+    if problem.B == 0:
+        raise InputError("problem", "at least one problem to show", "an empty batch")
+    look, (rows, results, touching) = look_of(problem.dynamics), _told(problem, solution)
+    return flights_of(
+        paced(problem, solution.times), look, solution.X, solution.U, name, results, rows, ADMITTED, touching
+    )
+
+
+def show_phases(members: Sequence[Problem], solutions: Sequence[Solution], begins: np.ndarray) -> HtmlPage:
+    """The page of phases, one after the other, each in a colour of its own, with its vehicle and obstacles.
+
+    Args:
+        members, solutions: of each phase.
+        begins: when each begins, (B, P+1), s.
+
+    Raises:
+        InputError: as `show`, of each phase; positions of other dimensions.
+    """
+    first, names = members[0], [f"phase {i + 1}" for i in range(len(members))]
+    flights, t, constraints, knots = [], [], list[str](), 0
+    for i, (one, found, name) in enumerate(zip(members, solutions, names, strict=True)):
+        shown, before = _flights(one, found, name), len(constraints)
+        if (sizes := [p.position.stop - p.position.start for p in (first, one)])[0] != sizes[1]:
+            raise InputError("problem", f"a position in {sizes[0]}-D of all phases", f"{sizes[1]}-D of {name}")
+        phase = ShownPhase(one, knots)
+        flights.append([replace(f, phase=phase, worst=np.where(f.worst < 0, -1, f.worst + before)) for f in shown])
+        constraints += [f"{kind_of(part)} of {name}" for part in one.constraints]
+        own, dt = _times(one, found)
+        own = dt * np.arange(one.N + 1) if own is None else own
+        t.append(np.broadcast_to(own, (one.B, one.N + 1)) + begins[:, i : i + 1])
+        knots += one.N + 1
+    about = f"{first.B} problems of {len(members)} phases" if first.B > 1 else f"{len(members)} phases"
+    look, shapes = look_of(first.dynamics), [shape for one in members if (shape := shape_of(one)) is not None]
+    document = Document(
+        "torchgco", about, first.position.stop - first.position.start, float(_times(first, solutions[0])[1]), look,
+        max(radius_of(one) for one in members), names, constraints, shape=shapes[0] if shapes else None,
+    )  # fmt: skip
+    for b in range(first.B):
+        times_of_all = np.concatenate([part[b] for part in t])
+        document.add(f"problem {b}", first, b, [each[b] for each in flights], times=times_of_all, phases=members)
+    return HtmlPage(page(document), "Phases one after the other")
 
 
 def show_fleet(members: Sequence[Problem], solutions: Sequence[Solution]) -> HtmlPage:

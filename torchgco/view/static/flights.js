@@ -19,8 +19,23 @@ export class Flights {
       const before = this.all.slice(0, i).map((one) => one.points);
       if (line) dashWhereShared(line.geometry, points, before, 1.5 * this.thick, 6 * this.thick);
     });
-    this.knots = Math.max(1, ...this.all.map((one) => one.flight.path.rows - 1));
     this.times = layout.times ? layout.times.data : null;
+    this.phases = layout.flights.map(({ phase }) => phase).filter(Boolean);
+    const longest = Math.max(1, ...this.all.map((one) => one.flight.path.rows - 1));
+    this.knots = this.phases.length ? this.times.length - 1 : longest; // phases follow each other
+  }
+
+  /** When obstacles are at a time, s: they count in steps of equal length, and those of each phase from its start. */
+  clocks(t) {
+    const knots = this.knotsAt(t);
+    if (!this.phases.length) return { times: [knots * this.head.dt], present: 0 };
+    const times = this.phases.map(({ first, stages, dt }) => Math.min(Math.max(knots - first, 0), stages) * dt);
+    return { times, present: this.present(knots) };
+  }
+
+  /** Which phase a knot is of, or what lies behind it: at a jump the later one. */
+  present(knots) {
+    return Math.max(0, this.phases.findLastIndex(({ first }) => first <= knots));
   }
 
   /** Seconds from the first knot to the last of the longest flight. */
@@ -65,8 +80,8 @@ export class Flights {
       line.castShadow = true;
       group.add(line, ghost);
     }
-    const { radius, shape } = this.head;
-    const body = vehicle(this.head.body, radius || 0.012 * this.space.size, colour, this.space.flat, shape);
+    const { radius, shape, body: kind } = flight.phase ?? this.head;
+    const body = vehicle(kind, radius || 0.012 * this.space.size, colour, this.space.flat, shape);
     body.add(dot(colour));
     group.add(body, ...this.marks(flight, points));
     const parts = flight.plan ? new MissionParts(flight, colour, this.space) : null;
@@ -104,8 +119,11 @@ export class Flights {
 
   /** Move all vehicles to a time, s. */
   setTime(t) {
-    const knots = this.knotsAt(t);
+    const all = this.knotsAt(t);
+    const now = this.phases[this.present(all)];
     for (const { flight, body, line, parts } of this.all) {
+      const knots = Math.max(0, all - (flight.phase?.first ?? 0));
+      body.visible = flight.phase === now;
       const place = this.place(...between(flight.path, knots));
       body.position.copy(place);
       if (flight.attitude) body.quaternion.copy(attitude(flight.attitude, knots));

@@ -109,7 +109,9 @@ class Page {
   async choose(number) {
     this.number = number;
     const layout = await part(`part-${number}`);
-    layout.obstacles = await Promise.all(layout.obstacles.map((one) => ("shared" in one ? part(`map-${one.shared}`) : one)));
+    layout.obstacles = await Promise.all(
+      layout.obstacles.map(async (one) => ("shared" in one ? { ...(await part(`map-${one.shared}`)), phase: one.phase } : one)),
+    );
     if (number !== this.number) return;
     this.layout = layout;
     // Maps may have a ceiling: it is cut off at first.
@@ -128,8 +130,8 @@ class Page {
     scene.background = new THREE.Color(colours.sky);
     this.space = spaceOf(layout, this.head);
     if (this.still) scene.fog = new THREE.Fog(colours.sky, 0.7 * this.space.size, 2.2 * this.space.size);
-    this.obstacles = obstacles(layout.obstacles, this.space, colours, this.still);
     this.flights = new Flights(layout, this.head, this.space);
+    this.obstacles = obstacles(layout.obstacles, this.flights.phases, this.space, colours, this.still);
     this.search = layout.search ? new Search(layout.search, this.space) : null;
     this.around = surroundings(layout, this.space, colours, this.still);
     aim(this.sun, this.space);
@@ -225,7 +227,7 @@ class Page {
 
   setTime(t) {
     this.time = Math.min(Math.max(0, t), this.flights.duration);
-    this.obstacles.setTime(this.flights.knotsAt(this.time) * this.head.dt); // they count in steps of equal length
+    this.obstacles.setClocks(this.flights.clocks(this.time));
     this.flights.setTime(this.time);
     if (this.shown.follow) this.follow();
     this.redraw();
@@ -236,14 +238,14 @@ class Page {
   }
 
   tell() {
-    const [first] = this.flights.all;
+    const first = this.flights.all.find(({ body }) => body.visible);
     if (first) this.canvas.dataset.vehicle = first.body.position.toArray().map((value) => value.toFixed(3)).join(" ");
     this.canvas.dataset.frames = this.frames;
     showTime(this.time, this.flights.duration, this.playing);
   }
 
   follow() {
-    const led = this.flights.all.find(({ group }) => group.visible);
+    const led = this.flights.all.find(({ group, body }) => group.visible && body.visible);
     if (!led) return;
     this.orbit.target.copy(led.body.position);
     this.orbit.place();

@@ -146,8 +146,28 @@ function shaded(kind, options, uniforms) {
   return made;
 }
 
-/** The obstacles of a layout as meshes, and the numbers that the scene changes later. */
-export function obstacles(parts, space, colours, still) {
+/** The obstacles of a layout, of which those of a phase are there while it lasts. */
+export function obstacles(parts, phases, space, colours, still) {
+  const sets = phases.length
+    ? phases.map(({ radius }, i) => obstaclesOf(parts.filter((one) => one.phase === i), { ...space, radius }, colours, still))
+    : [obstaclesOf(parts, space, colours, still)];
+  const group = new THREE.Group();
+  group.add(...sets.map((set) => set.group));
+  const each = (name) => [name, (value) => sets.forEach((set) => set[name](value))];
+  return {
+    group,
+    unknown: sets.find((set) => set.unknown)?.unknown ?? null,
+    ...Object.fromEntries(["setCeiling", "setGrown", "setUnknown", "setSeeThrough", "dispose"].map(each)),
+    setClocks: ({ times, present }) =>
+      sets.forEach((set, i) => {
+        set.group.visible = i === present;
+        set.setTime(times[i]);
+      }),
+  };
+}
+
+/** Obstacles as meshes, and the numbers that the scene changes later. */
+function obstaclesOf(parts, space, colours, still) {
   const group = new THREE.Group();
   const uniforms = Object.fromEntries(
     Object.entries({ time: 0, low: space.low, high: space.high, grown: 0, ceiling: NONE }).map(([name, value]) => [name, { value }]),
