@@ -287,7 +287,7 @@ def test_a_robot_speeds_up_in_a_bend_where_only_that_serves() -> None:
 
 
 def test_feasible_speaks_of_what_lies_between_the_knots() -> None:
-    """Of a vehicle that drives along thin poles with long stages, in every period what a dense look at the plan says."""
+    """Of a vehicle that passes thin poles with long stages, in every period what a dense look at the plan says."""
     model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.4, "rk4", slice(0, 2))
     cost = QuadraticCost(Q=[0.3, 1.0, 0.05, 0.05], R=[0.05, 0.05], Qf=[5.0, 5.0, 0.5, 0.5], x_ref=[8.0, 0.0, 0.0, 0.0])
     poles = Spheres([[1.5, 0.05], [3.0, -0.1], [4.6, 0.1], [6.1, -0.05]], 0.05, 0.1)
