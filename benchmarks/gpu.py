@@ -97,7 +97,7 @@ class Bench:
         with working_on(self.device), warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", DeviceWarning)
             found, served = call(), has_served()
-        refused = [first_line(one.message) for one in told if issubclass(one.category, DeviceWarning)]
+        refused = [str(one.message).splitlines()[0] for one in told if issubclass(one.category, DeviceWarning)]
         if refused or not served:
             self.failures.append(f"{what}: {'; '.join(dict.fromkeys(refused)) or 'left to the CPU'}")
         return found, served and not refused
