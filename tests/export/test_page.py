@@ -41,15 +41,21 @@ def test_the_firmware_of_the_page_compiles(folder: Path, tmp_path: Path) -> None
 @pytest.mark.slow
 @needs("gcc", "g++")
 def test_the_node_of_the_page_steers(folder: Path, tmp_path: Path) -> None:
-    """With stubs of rclcpp, which deliver a message of each kind and let three periods pass."""
+    """With stubs of rclcpp: nothing is published before anything came in, and the car stops without odometry."""
     text = block("cpp")
     assert len(text.splitlines()) <= 100
     (tmp_path / "node.cpp").write_text(text)
     said("gcc", *STRICT, "-O2", "-c", "car.c", "-o", tmp_path / "car.o", folder=folder)
     flags = "-std=c++17", "-Wall", "-Wextra", f"-I{STUBS}", f"-I{folder}"
     said("g++", *flags, tmp_path / "node.cpp", tmp_path / "car.o", "-lm", "-o", tmp_path / "node", folder=folder)
-    lines = said(tmp_path / "node", folder=folder).splitlines()
-    assert len(lines) == 3 and all(re.fullmatch(r"published -?[0-3]\.\d{3} -?0\.\d{3}", line) for line in lines)
+    printed = said(tmp_path / "node", folder=folder).splitlines()
+    lines = [line for line in printed if line.startswith("published")]
+    assert len(lines) == 10 and all(re.fullmatch(r"published (\d\.\d{3} ){2}-?0\.\d{3}", line) for line in lines)
+    speeds = [float(line.split()[1]) for line in lines]
+    assert (
+        all(2.5 < speed < 3.5 for speed in speeds[:8])
+        and lines[8:] == [re.sub(r"d .* ", "d 0.000 3.000 ", lines[9])] * 2
+    )
 
 
 WORDS = "model=planar", "scenario=planar_random", "study.layouts=2", "seed=3"

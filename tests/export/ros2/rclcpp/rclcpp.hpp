@@ -1,10 +1,12 @@
-// A stub of what the manual's node uses of rclcpp: `spin` delivers a message of each kind, and runs the timer three times.
+// A stub of what the manual's node uses of rclcpp: `spin` runs the timer once before anything is known, delivers a message
+// of each kind, runs the timer three times, and seven times more when the messages are old.
 #pragma once
 #include <chrono>
 #include <cstdio>
 #include <functional>
 #include <memory>
 #include <string>
+#include <thread>
 #include <type_traits>
 #include <vector>
 
@@ -49,8 +51,11 @@ public:
 inline void init(int, char**) {}
 inline void shutdown() {}
 inline void spin(std::shared_ptr<Node>) {
+    for (auto& timer : timers()) timer();
     for (auto& message : messages()) message();
     for (int period = 0; period < 3; period++) for (auto& timer : timers()) timer();
+    std::this_thread::sleep_for(std::chrono::milliseconds(400));
+    for (int period = 0; period < 7; period++) for (auto& timer : timers()) timer();
 }
 }  // namespace rclcpp
 
