@@ -319,8 +319,8 @@ def test_nothing_is_cut_off_on_a_phone(tab: Tab, width: int) -> None:
         tab.wait(f"innerWidth === {width}")
         beyond = "[...document.querySelectorAll('body *')].filter((e) => e.getClientRects().length && "
         beyond += "!e.closest('.unseen') && (e.getBoundingClientRect().right > innerWidth + 0.5 || "
-        beyond += "e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display === 'block' && e.tagName !== 'SELECT'))"
-        beyond += ".map((e) => e.id)"
+        beyond += "e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display === 'block' && "
+        beyond += "e.tagName !== 'SELECT')).map((e) => e.id)"
         assert tab.evaluate(beyond) == []
         assert tab.evaluate("document.documentElement.scrollWidth") == width
         assert tab.evaluate("document.getElementById('fold').getBoundingClientRect().bottom") <= 640
