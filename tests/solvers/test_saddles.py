@@ -10,7 +10,17 @@ from torch import Tensor
 
 import torchgco
 from tests.engines import compiled
-from torchgco import ControlBounds, FreeTime, FunctionCost, FunctionDynamics, Goal, InteriorPoint, Problem, Status
+from torchgco import (
+    ControlBounds,
+    FreeTime,
+    FunctionCost,
+    FunctionDynamics,
+    Goal,
+    InteriorPoint,
+    Problem,
+    Spheres,
+    Status,
+)
 from torchgco.kernels import use_native
 from torchgco.solvers.contracts import Call
 
@@ -152,3 +162,17 @@ def test_a_fall_without_end_along_what_no_row_bounds_is_told(solver: str) -> Non
     bounds = ControlBounds([-1.0, -torch.inf], [1.0, torch.inf])
     found = torchgco.solve(Problem(POINT, cost, [bounds], torch.zeros(2, 2, dtype=D), 10), solver=solver, verbose=False)
     assert found.statuses == [Status.UNBOUNDED] * 2 and bool((found.violation <= 1e-6).all())
+
+
+@compiled
+@pytest.mark.filterwarnings("ignore::torchgco.GuidanceWarning")
+def test_a_start_on_top_is_left_among_obstacles_near_and_far() -> None:
+    """Both sides of a ridge fall alike, and an obstacle lies far away, on one side, or on the other."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, 0.1, "rk4", position=slice(0, 2))
+    cost = FunctionCost(lambda x, u: 0.01 * u.square().sum(-1) + x[..., 0].cos() + x[..., 1].square(), None)
+    centers = torch.tensor([[[50.0, 50.0]], [[2.0, 0.0]], [[-2.0, 0.0]]], dtype=D)
+    obstacles = Spheres(centers, [1.0], 0.3)
+    problem = Problem(model, cost, [obstacles, ControlBounds(-3.0, 3.0)], torch.zeros(3, 4, dtype=D), 20)
+    found = torchgco.solve(problem, verbose=False)
+    assert found.statuses == [Status.CONVERGED] * 3 and bool((found.cost < 10.0).all())
+    assert float(torchgco.certify(problem, found.X, found.U).clearance.min()) >= 0

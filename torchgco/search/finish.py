@@ -109,9 +109,7 @@ class Converge(Row):
     def _tighten(self, search: Search) -> None:
         best, rows, whole = search.best, _unsolved(search), replace(search.call, callback=None)  # not worth a report
         if rows.numel() > 0:
-            # Of others the interior point has left the saddle points before, or they lie among obstacles.
-            escapes = not search.call.problem.constraints
-            keep_clear(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best, escapes))
+            keep_clear(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best, escapes=True))
         lost = best.end.best.violation[rows] > search.solver.violation_tolerance
         lost = rows[lost & ~is_over(best.end.status[rows])]
         if lost.numel() > 0:
@@ -166,7 +164,7 @@ def continued(solver: InteriorPoint, call: Call, start: Iterate, escapes: bool =
     """Solves of a call from trajectories, with their multipliers, among the obstacles near these.
 
     Args:
-        escapes: as of `InteriorPoint.solved`, without obstacles.
+        escapes: as of `InteriorPoint.solved`.
     """
     return solved_nearby(solver, replace(call, U0=start.U, warm=start.multipliers), start.X, escapes)
 
@@ -176,10 +174,10 @@ def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor, escapes: bool = 
     near = Nearby.along(call, X)
     if near is None:
         return solver.solved(call, X, escapes=escapes)
-    found = solver.solved(near.call, X)
+    found = solver.solved(near.call, X, escapes=escapes)
     wrong, end = near.wrong(found.best), replace(found, best=near.whole(found.best), last=near.whole(found.last))
     if wrong.numel() > 0:
-        again = solver.solved(call.take(wrong), X[wrong])
+        again = solver.solved(call.take(wrong), X[wrong], escapes=escapes)
         put(end, wrong, replace(again, iterations=end.iterations[wrong] + again.iterations))
     return end
 
