@@ -16,7 +16,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from torchgco.base.autodiff import gradients, slope_along
+from torchgco.base.autodiff import gradients, jacobian, slope_along
 from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import check_shape, computing_on
 from torchgco.constraints.base import Distance, least
@@ -31,6 +31,7 @@ from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import bends
 
 HARDLY_SEEN = 1e-6  # share of the cost that a control is held to change over its range at least
+LITTLE = 1e-3  # share of a control's size: by as much as its slopes change over that, they count at least
 NEGLIGIBLE = 1e-9  # smallest scale of a control, as a share of the largest scale among all controls
 ACTIVE_WITHIN = 1e-3  # an inequality with at most this slack (m for obstacles) may have a multiplier
 
@@ -52,8 +53,9 @@ class Certificate:
     bound_violation: Tensor
     # Largest component of the Lagrangian's gradient with respect to U, and to what is free in the start, with the
     # multipliers (inequalities: at least 0) that make it smallest in the least-squares sense, as a share of the largest
-    # terms that cancel in the gradient of J_var with respect to the same control: no unit of cost or control changes
-    # it. Near 0 it proves a stationary point to first order, not a minimum, and says nothing about rows that are
+    # terms that cancel in the gradient of J_var with respect to the same control, of which those that cancel within the
+    # code of the cost are known by its curvature alone: see `_least_scales`. No unit of cost or control changes it.
+    # Near 0 it proves a stationary point to first order, not a minimum, and says nothing about rows that are
     # violated. Of multipliers that are given: the larger of two numbers without units, which are those of IPOPT's end
     # test (Waechter and Biegler 2006, equation 5) with scales of the trajectory instead of fixed ones. The first is the
     # largest component of the Lagrangian's gradient, as a share of the largest terms that cancel in it with respect to
@@ -185,7 +187,7 @@ def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
         return torch.full_like(X[0, 0, 0], torch.nan)
     senses = [equality for equality, (rows, _) in active for _ in rows]
     rest = X.new_tensor(_fit(slopes[0], slopes[1:], np.array(senses, dtype=bool)))
-    return _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _hardly_seen(problem, X, U))
+    return _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _least_scales(problem, X, U))
 
 
 def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]) -> Tensor:
@@ -198,7 +200,7 @@ def _given_kkt(problem: Problem, X: Tensor, U: Tensor, multipliers: list[Tensor]
     reduced, terms, start = _reduced(problem, X, U, *gradients(_lagrangian(problem, lams), X, U))
     free = _free(problem)
     rest = torch.cat((reduced[0].flatten(), start[0][0, free]))
-    unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _hardly_seen(problem, X, U))
+    unfit = _share(rest, U[0], torch.cat((terms.amax(0), start[1][free])), _least_scales(problem, X, U))
     cost = (problem.cost.total(X, U) - problem.cost_scale.constant)[0].abs()
     cost = cost + problem.cost_scale.size[0]
     products = [torch.where(lam != 0, lam * c, 0.0).abs().flatten() for lam, c in zip(lams, rows, strict=True)]
@@ -236,16 +238,43 @@ def _free(problem: Problem) -> Tensor:
     return torch.zeros_like(problem.x0[0], dtype=torch.bool) if problem.free_start is None else problem.free_start[0]
 
 
-def _hardly_seen(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """The least scales (m,) of slopes by controls: `HARDLY_SEEN` of the cost over the range of their bounds.
+def _least_scales(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The least scales (m,) of slopes by controls, where fewer terms are seen to cancel: the largest of three.
 
-    By a control on which nothing depends, as where time alone costs, no terms cancel: what is left of rounding and of
-    far rows' multipliers isn't measured by itself.
+    Within a stage's cost terms cancel unseen, and of a control on which nothing depends, as where time alone costs, no
+    terms cancel: what is left of rounding and of far rows' multipliers isn't measured by itself. So slopes count at
+    least by how much they change over `LITTLE` of the controls' sizes; as one with which a step to where it is 0 saves
+    `HARDLY_SEEN` squared of the cost; and as `HARDLY_SEEN` of the cost over the range of the control's bounds.
     """
-    bounds = problem.control_bounds
+    cost, bounds = problem.cost.total(X, U)[0], problem.control_bounds
+    try:
+        curvatures, scale = _curvatures(problem, X, U), problem.cost_scale
+    except RuntimeError:  # an operation of the cost or the model has no such derivatives
+        least = torch.zeros_like(U[0, 0])
+    else:
+        changes = LITTLE * (curvatures @ U[0].abs().amax(0))
+        worth = (cost - scale.constant[0]).abs() + scale.size[0]
+        least = torch.maximum(changes, HARDLY_SEEN * (2.0 * worth * curvatures.diagonal()).sqrt()).nan_to_num(0.0, 0.0)
     if bounds is None:
-        return torch.zeros_like(U[0, 0])
-    return (HARDLY_SEEN * problem.cost.total(X, U).abs() / bounds.range[0]).nan_to_num(0.0, 0.0).expand(U.shape[-1])
+        return least
+    return torch.maximum(least, (HARDLY_SEEN * cost.abs() / bounds.range[0]).nan_to_num(0.0, 0.0))
+
+
+def _curvatures(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
+    """The largest second derivatives of J_var by control i of a stage and j of it or the one before, (m, m), each a sum
+    of magnitudes: directly, and by the state that follows.
+    """
+    m, k = U.shape[-1], torch.arange(U.shape[-1], device=U.device)
+    by_x, by_u = X.new_zeros(2 * m, *X.shape), U.new_zeros(2 * m, *U.shape)
+    by_u[k, ..., k] = 1.0
+    fu = jacobian(lambda u: problem.along.step(X[:, :-1], u), U)[0]  # (1, N, n, m)
+    by_x[m:, :, 1:] = fu.movedim(-1, 0)
+    slopes = lambda x, u: torch.cat([g.flatten(1) for g in gradients(problem.cost.total, x, u)], dim=1)
+    changes = torch.func.vmap(lambda x, u: slope_along(slopes, (X, U), (x, u)))(by_x, by_u)
+    changes = changes.abs().view(2, m, -1).sum(0)
+    of_x, of_u = changes.split((X.numel(), U.numel()), dim=-1)
+    by_state = of_x.view(m, *X.shape[1:])[:, 1:].unsqueeze(-2) @ fu[0].abs()  # (m, N, 1, m)
+    return (of_u.view(m, *U.shape[1:]) + by_state.squeeze(-2)).amax(1).mT
 
 
 def _share(rest: Tensor, U: Tensor, scale: Tensor, least: Tensor) -> Tensor:

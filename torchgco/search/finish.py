@@ -109,7 +109,7 @@ class Converge(Row):
     def _tighten(self, search: Search) -> None:
         best, rows, whole = search.best, _unsolved(search), replace(search.call, callback=None)  # not worth a report
         if rows.numel() > 0:
-            keep_clear(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best))
+            keep_clear(search, rows, continued(search.interior, whole.take(rows), best.of(rows).best, escapes=True))
         lost = best.end.best.violation[rows] > search.solver.violation_tolerance
         lost = rows[lost & ~is_over(best.end.status[rows])]
         if lost.numel() > 0:
@@ -160,20 +160,24 @@ def _unsolved(search: Search) -> Tensor:
     return (~is_over(status) & (status != Status.INVALID_START)).nonzero().flatten()
 
 
-def continued(solver: InteriorPoint, call: Call, start: Iterate) -> SolveEnd:
-    """Solves of a call from trajectories, with their multipliers, among the obstacles near these."""
-    return solved_nearby(solver, replace(call, U0=start.U, warm=start.multipliers), start.X)
+def continued(solver: InteriorPoint, call: Call, start: Iterate, escapes: bool = False) -> SolveEnd:
+    """Solves of a call from trajectories, with their multipliers, among the obstacles near these.
+
+    Args:
+        escapes: as of `InteriorPoint.solved`.
+    """
+    return solved_nearby(solver, replace(call, U0=start.U, warm=start.multipliers), start.X, escapes)
 
 
-def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor) -> SolveEnd:
-    """Solves of a call from states X (B, N+1, n), among the obstacles near these."""
+def solved_nearby(solver: InteriorPoint, call: Call, X: Tensor, escapes: bool = False) -> SolveEnd:
+    """Solves of a call from states X (B, N+1, n), among the obstacles near these; `escapes` as of `continued`."""
     near = Nearby.along(call, X)
     if near is None:
-        return solver.solved(call, X)
-    found = solver.solved(near.call, X)
+        return solver.solved(call, X, escapes=escapes)
+    found = solver.solved(near.call, X, escapes=escapes)
     wrong, end = near.wrong(found.best), replace(found, best=near.whole(found.best), last=near.whole(found.last))
     if wrong.numel() > 0:
-        again = solver.solved(call.take(wrong), X[wrong])
+        again = solver.solved(call.take(wrong), X[wrong], escapes=escapes)
         put(end, wrong, replace(again, iterations=end.iterations[wrong] + again.iterations))
     return end
 

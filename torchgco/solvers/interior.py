@@ -32,11 +32,11 @@ from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call, Progress, Solver
 from torchgco.solvers.convexity import half_ranges, is_affine, looks_convex_row
-from torchgco.solvers.ending import STATIONARY, start_status
+from torchgco.solvers.ending import STATIONARY, optimality, start_status
 from torchgco.solvers.ilqr import ILQR, descend
 from torchgco.solvers.session import Session
 from torchgco.solvers.timing import Chooser
-from torchgco.solvers.unbounded import ROUNDING, beyond_rounding
+from torchgco.solvers.unbounded import ROUNDING, beyond_rounding, falls_without_end
 
 WITHOUT_END = Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED, Status.NOT_POSITIVE_DEFINITE, Status.NON_FINITE
 HEAVY = 1e11  # penalty beside which a cost of one unit counts for nothing
@@ -219,7 +219,8 @@ class InteriorPoint(Solver, named="solver"):
             guess: `guessed` of the call, where it is known.
             smoothing: mu in units of the cost: J_var - mu times the logarithms of all slacks is minimised; 0: J_var.
             escapes: where the conditions of first order hold but the cost falls to second order, as at an equilibrium
-                that a guess at rest never leaves, solve again from beside, and keep what costs less.
+                that a guess at rest never leaves, solve again from beside, and keep what costs less, or falls without
+                end.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         try:
@@ -256,7 +257,10 @@ class InteriorPoint(Solver, named="solver"):
         return end
 
     def _escape(self, kernels: InteriorKernels, call: Call, end: SolveEnd, falls: Tensor) -> None:
-        """Solve again beside the results that `falls` (B,) marks; what costs less takes their place in `end`."""
+        """Solve again beside the results that `falls` (B,) marks; what costs less takes their place in `end`.
+
+        So does a cost that falls without end, whose solve has none either.
+        """
         for share in SADDLE_STEPS:
             rows = falls.nonzero().flatten()
             if rows.numel() == 0:
@@ -269,12 +273,22 @@ class InteriorPoint(Solver, named="solver"):
             new = SolveEnd.blank(near.problem, near.U0)
             fell = self._some(kernels, near, open_loop(near.problem, near.U0), torch.arange(len(rows)), new, 0.0, True)
             cheaper = new.best.cost < old.cost - STATIONARY * old.cost.abs()
-            better = (new.status == SOLVED) & cheaper & (new.best.violation <= self.admitted(near.problem))
+            better = cheaper & (new.best.violation <= self.admitted(near.problem))
+            better &= (new.status == SOLVED) | self._endless(near, new, better)
             end.iterations[rows] += new.iterations
             kept = better.nonzero().flatten()
             put(end.best, rows[kept], take(new.best, kept))
             put(end.last, rows[kept], take(new.best, kept))
             falls[rows[kept]] = fell[kept]
+
+    def _endless(self, call: Call, end: SolveEnd, asked: Tensor) -> Tensor:
+        """Where of the failed solves of a call that are `asked` for (B,) the cost falls without end, (B,) bool."""
+        endless = asked & ~is_over(end.status) & torch.isfinite(end.best.cost)
+        if (rows := endless.nonzero().flatten()).numel() > 0:
+            problem, best = call.problem.take(rows), take(end.best, rows)
+            left = optimality(Lagrangian(problem, best.multipliers, None, phr=True), best.X, best.U, best.cost).left
+            endless[rows] = falls_without_end(problem, call.U0[rows], best, left, self.admitted(problem))
+        return endless
 
     def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
