@@ -311,6 +311,15 @@ def test_a_model_without_a_known_field_has_no_errors() -> None:
     assert "too long" not in found.explain(0)
 
 
+def test_half_steps_that_are_nan_where_whole_ones_are_not_are_large() -> None:
+    field = lambda x, u: torch.where((x > 0.4) & (x < 0.6), torch.nan, 1.0 + 0.0 * u)
+    problem = Problem(FunctionDynamics(field, 1, 1, 1.0, "euler"), QuadraticCost([1.0], [1.0], [1.0]), [], [[0.0]], 2)
+    X, U = torch.tensor([[[0.0], [1.0], [2.0]]], dtype=D), torch.zeros(1, 2, 1, dtype=D)
+    errors = step_errors(problem, X, U)
+    assert float(errors.step_error) == torch.inf and bool(errors.large) and bool(errors.step_cost.isnan())
+    assert errors.told(0, problem) == "half of dt = 1 s makes state 0 NaN at stage 0"
+
+
 def by_hand(field: Any, x: Tensor, u: Tensor, h: Tensor) -> Tensor:
     """A step of Runge and Kutta over h (..., 1)."""
     k1 = field(x, u)

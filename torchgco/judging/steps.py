@@ -70,7 +70,8 @@ class StepErrors:
         error, cost = float(self.step_error[b]), float(self.step_cost[b])
         dt = "dt of a stage" if problem.time is not None else f"dt = {problem.dynamics.dt:g} s"
         more = "" if cost != cost else f", and the cost by {self.cost_told(b)}"
-        what = f"half of {dt} changes state {where}{name} by {error:.2g} of its range"
+        change = "makes state {}{} NaN" if error == torch.inf else f"changes state {{}}{{}} by {error:.2g} of its range"
+        what = f"half of {dt} {change.format(where, name)}"
         return f"{what} at stage {int(self.stage[b])}{more}"
 
     def cost_told(self, b: int, times: float = 1.0) -> str:
