@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, reduce
 from typing import Any
@@ -20,7 +21,7 @@ from torchgco.constraints.base import ADMITTED
 from torchgco.explaining.explain import Account
 from torchgco.judging.certificate import Certificate, certify
 from torchgco.judging.judge import Verdict, doubled, in_double, judge
-from torchgco.judging.steps import Costates, cost_of, differences
+from torchgco.judging.steps import Costates, costates_of, differences, first_order_cost
 from torchgco.kernels import costates, current
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
@@ -229,8 +230,8 @@ def certify_phases(phases: Phases, solution: Any, asked: Tensor | None) -> Certi
 
 
 def _step_cost(whole: Whole, solution: Any, certificate: Certificate) -> Tensor:
-    """By how much the steps of all phases change the cost of all, as of `StepErrors`; NaN where nothing is certified,
-    or no phase has a known field."""
+    """By how much the steps of all phases change the cost of all, as of `StepErrors`, to first order; NaN where nothing
+    is certified, or no phase has a known field."""
     costs, none = torch.full_like(certificate.dynamics_residual, torch.nan), True
     rows, found = (~certificate.dynamics_residual.isnan()).nonzero().flatten(), solution.found
     problem = in_double(whole.problem.take(rows))
@@ -243,7 +244,9 @@ def _step_cost(whole: Whole, solution: Any, certificate: Certificate) -> Tensor:
         if of_phase is not None:
             e[:, span.stages, : member.n], none = of_phase, False
     if len(rows) and not none:
-        costs[rows] = cost_of(problem, X, U, e, None, [lam[rows].double() for lam in found.multipliers.lam])
+        lams = [lam[rows].double() for lam in found.multipliers.lam]
+        with suppress(RuntimeError):  # code that autograd can't differentiate
+            costs[rows] = first_order_cost(problem, X, U, e, costates_of(problem, X, U, lams))
     return costs
 
 
