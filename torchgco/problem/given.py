@@ -22,9 +22,10 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.gradients import asking, leaves, recording, without_gradients
+from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions, as_states, check_untransformed, describe
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, Sense
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles
@@ -206,6 +207,7 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
         knots = getattr(result, "knots", None)
         if not isinstance(knots, slice) and not (isinstance(knots, Tensor) and knots.dtype == torch.int64):
             raise InputError(f"{field}.knots", "a slice or an int64 tensor (K,), which `bind` sets", shown(knots))
+        check_value(result.sense, Sense, f"{field}.sense")
     for name in _lost(part, result):
         expected = f"a class whose own methods are called: {type(result).__name__} takes its place"
         raise InputError(f"{field}.{name}", expected, f"one of {type(part).__name__}")
