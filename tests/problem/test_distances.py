@@ -1,4 +1,4 @@
-"""A user's kind of obstacles is checked when a problem is made: shapes, distances by separate code, larger obstacles."""
+"""A user's kind of obstacles is checked when a problem is made: shapes, distances by separate code, growth."""
 
 from __future__ import annotations
 
@@ -70,6 +70,7 @@ def other(**methods: Any) -> type[Discs]:
 
 
 signed, segment, measured, value = Discs.signed_distance, Discs.segment_clearance, Discs.measured, Discs.value
+upright = lambda x: torch.eye(2, dtype=D).expand(*x.shape[:-1], 2, 2)
 WRONG: dict[str, tuple[str, str, Callable[[], Problem]]] = {
     "nothing grows": ("Own.grown", "got none", lambda: made(other(grown=Obstacles.grown))),
     "smaller": (
@@ -87,7 +88,7 @@ WRONG: dict[str, tuple[str, str, Callable[[], Problem]]] = {
     "rows that stay": (
         "constraints[0].grown",
         "minus `value` larger by 0 ",
-        lambda: made(other(rows=lambda self, p, t: 0.5 - (p.unsqueeze(2) - self.centers.unsqueeze(1)).square().sum(-1))),
+        lambda: made(other(rows=lambda self, p, t: -torch.cdist(p, self.centers))),
     ),
     "one column": (
         "constraints[0].signed_distance",
@@ -149,7 +150,7 @@ WRONG: dict[str, tuple[str, str, Callable[[], Problem]]] = {
         "as of `signed_distance`",
         lambda: made(
             other(measured=lambda self, X: tuple(d + 0.1 for d in measured(self, X))),
-            vehicle_radius=Body([[0.1, 0.0], [-0.1, 0.0]], 0.1, lambda x: torch.eye(2, dtype=D).expand(*x.shape[:-1], 2, 2)),
+            vehicle_radius=Body([[0.1, 0.0], [-0.1, 0.0]], 0.1, upright),
         ),
     ),
 }  # fmt: skip
@@ -179,3 +180,22 @@ def test_a_sense_that_is_none_is_refused(sense: Any) -> None:
     with pytest.raises(InputError, match="expected inequality or equality") as told:
         made(other(sense=sense))
     assert told.value.field == "constraints[0].sense"
+
+
+@pytest.mark.parametrize(
+    ("methods", "words"),
+    [
+        ({"rows": lambda self, p, t: signed(self, p, t)[..., 0] * SINGLE}, "instead of"),
+        ({"rows": lambda self, p, t: signed(self, p, t) + torch.zeros(3, 1, 2, dtype=D) * SINGLE}, "size of tensor"),
+        ({"rows": lambda self, p, t: p @ torch.eye(2)}, r"torch.float32 \(2, 2\) beside torch.float64"),
+    ],
+)
+def test_a_mix_of_types_is_named_only_where_it_fails(methods: dict[str, Any], words: str) -> None:
+    """A float32 number beside a float64 tensor is no mistake, and not the reason of another one."""
+    kind = other(grown=lambda self, by: self, segment_clearance=Obstacles.segment_clearance, **methods)
+    with pytest.raises(InputError, match=words) as told:
+        made(kind)
+    assert told.value.field == "constraints[0].value" and ("float32" in str(told.value)) == ("beside" in words)
+
+
+SINGLE = torch.ones(1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any
 
 import torch
@@ -96,7 +97,8 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
         method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
         what = "derivatives" if name == "field" else "states"
-        wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
+        wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states (numbers per problem are "
+        wanted += "`batched` or `per_element`)"
         _check_values(f"dynamics.{name}", method(single), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
         _check_among_all(f"dynamics.{name}", method(single), rows, len(x0), (x[:, 0], u[:, 0]))
         of_stages = called(f"dynamics.{name}", wanted, method(several), rows, x, u)
@@ -140,7 +142,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
         InputError: as `check_dynamics`.
     """
     rows, X, U, k = ends_of(x0), states_near(x0, N + 1), _controls(x0, N, m), torch.arange(N)
-    wanted = f"a number in {x0.dtype}, the type of x0, per state and control"
+    wanted = f"a number in {x0.dtype}, the type of x0, per state and control (numbers per problem are `batched`)"
     stage: Callable[..., Any] = lambda i, x, u, k=k: cost.take(i).stage(x, u, k)
     _check_values("cost.stage", stage, rows, (X[:, :-1], U), (2, N), wanted)
     _check_values("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, (X[:, 0], U[:, 0]), (2,), wanted)
@@ -206,6 +208,8 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
         _check_rows(constraint, field, rows, len(x0), X, U)
     else:
         _check_apart(field, value, rows, X, U)
+        if not constraint.joins_knots:
+            _check_knots(constraint, field, rows, X, U)
     weights = 1.0 + 0.5 * scattered(X.new_empty(shape))
 
     def own(dX: Tensor, dU: Tensor) -> Tensor:
@@ -244,6 +248,18 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
         got = f"rows of knot {int(knots[differing])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
     _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
+
+
+def _check_knots(constraint: Constraint, field: str, rows: Tensor, X: Tensor, U: Tensor) -> None:
+    """Check that rows of a knot stay where states and controls of others change: any two differ in a digit."""
+    part, every = constraint.take(rows), torch.arange(X.shape[1], device=X.device)
+    knots, due = every[constraint.knots], part.value(X, U)
+    for digit, bit in product(range((X.shape[1] - 1).bit_length()), (0, 1)):
+        others = (every >> digit & 1 == bit).view(-1, 1)
+        changed = [torch.where(others[: z.shape[1]], z + OFFSET * _steps(z), z) for z in (X, U)]
+        wrong = unlike(called(field, ONE_KNOT, part.value, *changed), due).any(0).any(-1) & ~others[knots, 0]
+        if bool(wrong.any()):
+            raise InputError(field, ONE_KNOT, f"rows of knot {int(knots[wrong][0])} that depend on other knots")
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
