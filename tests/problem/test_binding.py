@@ -296,7 +296,7 @@ MISSING = {
     "NoValue.value": lambda: problem(NoValue()),
     "dynamics.bind": lambda: problem(dynamics=Nothing(dt=0.05)),
     "cost.expand": lambda: problem(cost=OtherSum()),
-    "cost.goal": lambda: problem(cost=own(OtherSum, goal=lambda self, x0: torch.zeros_like([1.0]))()),
+    "cost.goal": lambda: problem(cost=own(OtherSum, goal=lambda self, x0: x0 + "here")()),
 }
 
 

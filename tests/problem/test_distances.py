@@ -29,7 +29,7 @@ class Discs(Obstacles):
     vehicle_radius: Any  # (B,), m; or a `Body`
     knots: Any = None
     position: Any = None
-    dt: float = 0.0
+    dt: Any = 0.0
     batched = ("centers", "radii", "absent", "vehicle_radius")
     margins = property(lambda self: self.radii + self.vehicle_radius.unsqueeze(-1))  # type: ignore[assignment]
 
