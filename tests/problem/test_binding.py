@@ -349,26 +349,6 @@ def test_derivatives_that_are_wrong_are_named() -> None:
     assert told.value.field == "constraints[0].accumulate"
 
 
-@dataclass(frozen=True)
-class Sums(NoValue):
-    """Rows of a class that sum along the knots, before or behind them."""
-
-    knots = slice(1, N)
-    back: bool = False
-
-    def value(self, X: Tensor, U: Tensor) -> Tensor:
-        rows = U[:, 1:, :1]
-        return rows.flip(1).cumsum(1).flip(1) if self.back else rows.cumsum(1)
-
-
-@pytest.mark.parametrize("back", [False, True])
-def test_rows_of_a_class_that_join_knots_are_refused(back: bool) -> None:
-    with pytest.raises(InputError, match="that depend on other knots") as told:
-        problem(Sums(back))
-    assert told.value.field == "constraints[0].value"
-    assert "RateBounds" in str(told.value)
-
-
 def own(heir: type, **names: Any) -> Any:
     return dataclass(frozen=True)(type("Own", (heir,), names))
 

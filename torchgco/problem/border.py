@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from itertools import product
 from typing import Any
 
 import torch
@@ -208,8 +207,6 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
         _check_rows(constraint, field, rows, len(x0), X, U)
     else:
         _check_apart(field, value, rows, X, U)
-        if not constraint.joins_knots:
-            _check_knots(constraint, field, rows, X, U)
     weights = 1.0 + 0.5 * scattered(X.new_empty(shape))
 
     def own(dX: Tensor, dU: Tensor) -> Tensor:
@@ -248,18 +245,6 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
         got = f"rows of knot {int(knots[differing])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
     _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
-
-
-def _check_knots(constraint: Constraint, field: str, rows: Tensor, X: Tensor, U: Tensor) -> None:
-    """Check that rows of a knot stay where states and controls of others change: any two differ in a digit."""
-    part, every = constraint.take(rows), torch.arange(X.shape[1], device=X.device)
-    knots, due = every[constraint.knots], part.value(X, U)
-    for digit, bit in product(range((X.shape[1] - 1).bit_length()), (0, 1)):
-        others = (every >> digit & 1 == bit).view(-1, 1)
-        changed = [torch.where(others[: z.shape[1]], z + OFFSET * _steps(z), z) for z in (X, U)]
-        wrong = unlike(called(field, ONE_KNOT, part.value, *changed), due).any(0).any(-1) & ~others[knots, 0]
-        if bool(wrong.any()):
-            raise InputError(field, ONE_KNOT, f"rows of knot {int(knots[wrong][0])} that depend on other knots")
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
