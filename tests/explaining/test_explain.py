@@ -27,7 +27,7 @@ from torchgco import (
     Status,
 )
 from torchgco.explaining.advice import BY_STATUS, Facts, advice
-from torchgco.explaining.places import knots_told
+from torchgco.explaining.places import knots_told, lost_told
 from torchgco.solution import Fate
 
 
@@ -170,6 +170,43 @@ def test_lost_states_are_located() -> None:
     lost = replace(solution, X=X, status=torch.tensor([int(Status.FEASIBLE), int(Status.NON_FINITE)]))
     assert any("knot 7 isn't finite" in line for line in block(lost.explain(1), "Result"))
     assert BY_STATUS[Status.NON_FINITE] in block(lost.explain(1), "What to try")
+
+
+model = FunctionDynamics(lambda x, u: x + 0.1 * u, n=1, m=1, dt=0.1)
+square = lambda x, u: (x.square() + u.square()).sum(-1)
+last = lambda x: x.square().sum(-1)
+rows = lambda k: FunctionConstraint(lambda x: torch.where(x > -9.0, torch.nan, x), knots=[k], name="own")
+LOST = {
+    "cost.stage is NaN at knot 0 (t = 0 s)": (FunctionCost(lambda x, u: torch.nan * square(x, u), last), []),
+    "cost.stage is NaN at knot 3 (t = 0.3 s)": (
+        FunctionCost(lambda x, u, k: square(x, u) + (2.5 - k + 0.0 * x[..., 0]).sqrt(), last), [],
+    ),
+    "cost.terminal is NaN at knot 5 (t = 0.5 s)": (FunctionCost(square, lambda x: (last(x) - 9.0).sqrt()), []),
+    "constraints[1] (own) is NaN at knot 4 (t = 0.4 s)": (
+        FunctionCost(square, last), [ControlBounds(-torch.inf, 1.0), rows(4)],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("told", LOST)
+def test_the_part_and_the_knot_that_are_lost_are_named(told: str) -> None:
+    cost, parts = LOST[told]
+    problem = Problem(model, cost, parts, torch.zeros(2, 1, dtype=torch.float64), N=5)
+    solution = torchgco.solve(problem, solver="al_ilqr")
+    assert solution.statuses[1] is Status.NON_FINITE
+    assert f"{told}." in block(solution.explain(1), "Why it ended")
+    assert block(solution.explain(1), "What to try")[0].startswith("Numbers and code of that part that are finite")
+
+
+def test_a_derivative_that_is_lost_is_named() -> None:
+    cost = FunctionCost(square, lambda x: x.square().sum(-1).sqrt())
+    limit = FunctionConstraint(lambda x: x.square().sum(-1, keepdim=True).sqrt() - 1.0, knots=[2, 3], name="own")
+    zero, stay = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, 5, 1, dtype=torch.float64)
+    at_rest = torch.zeros(1, 6, 1, dtype=torch.float64)
+    told = lambda cost, parts: lost_told(Problem(model, cost, parts, zero, N=5), at_rest, stay, None)
+    assert told(cost, []) == "the derivative of the cost is NaN at knot 5"
+    assert told(FunctionCost(square, last), [limit]) == "the derivative of constraints[0] (own) is NaN at knot 2"
+    assert told(FunctionCost(square, last), []) is None
 
 
 def test_a_loaded_solution_says_what_is_known_and_takes_the_problem(tmp_path) -> None:

@@ -296,6 +296,7 @@ MISSING = {
     "NoValue.value": lambda: problem(NoValue()),
     "dynamics.bind": lambda: problem(dynamics=Nothing(dt=0.05)),
     "cost.expand": lambda: problem(cost=OtherSum()),
+    "cost.goal": lambda: problem(cost=own(OtherSum, goal=lambda self, x0: x0 + "here")()),
 }
 
 
@@ -346,3 +347,35 @@ def test_derivatives_that_are_wrong_are_named() -> None:
     with pytest.raises(InputError, match="where differences give") as told:
         problem(Doubled())
     assert told.value.field == "constraints[0].accumulate"
+
+
+def own(heir: type, **names: Any) -> Any:
+    return dataclass(frozen=True)(type("Own", (heir,), names))
+
+
+@dataclass(frozen=True)
+class Times(NoSlopes):
+    at: float = 0.5  # s: by the name of a method
+
+
+SHADOWED = {
+    "constraints[0].bare": lambda: problem(own(NoSlopes, bare=lambda self: 1)()),
+    "constraints[0].kernel": lambda: problem(own(NoSlopes, kernel="own")()),
+    "constraints[0].at": lambda: problem(Times()),
+    "constraints[0].in_metres": lambda: problem(own(NoSlopes, in_metres=lambda self: True)()),
+    "constraints[0].worst": lambda: problem(own(NoSlopes, worst=property(lambda self: 3.0))()),
+    "cost.stage": lambda: problem(cost=own(OtherSum, stage=0.5)()),
+    "dynamics.position": lambda: problem(dynamics=own(Planar, position=lambda self: slice(0, 2))(dt=0.05)),
+}
+
+
+@pytest.mark.parametrize("field", SHADOWED)
+def test_a_name_that_means_something_else_is_refused(field: str) -> None:
+    with pytest.raises(InputError, match=r"another name: by this one .* got one of ") as told:
+        SHADOWED[field]()
+    assert told.value.field == field
+
+
+def test_names_that_mean_the_same_are_free() -> None:
+    problem(own(NoSlopes, told=lambda self, row, knot, dynamics: "the power", power=3.0, geometric=False)())
+    problem(dynamics=own(Planar, position=slice(0, 2), speed=lambda self, x: x[..., 3])(dt=0.05))

@@ -15,35 +15,49 @@ from torchgco.base.shapes import MISTAKES
 
 
 class _FirstMix(TorchFunctionMode):
-    """Keeps the first call that takes tensors of `dtype` and of another floating-point type: the call and the other."""
+    """Keeps the first call that takes tensors of `dtype` and of another floating-point type: the call and the other.
 
-    def __init__(self, dtype: torch.dtype) -> None:
+    Of those that `fail` the first, or any.
+    """
+
+    def __init__(self, dtype: torch.dtype, fail: bool) -> None:
         super().__init__()
-        self.dtype = dtype
+        self.dtype, self.fail = dtype, fail
         self.found: tuple[Any, Tensor] | None = None
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         leaves = tree_leaves((args, kwargs))
         kinds = {leaf.dtype: leaf for leaf in leaves if isinstance(leaf, Tensor) and leaf.is_floating_point()}
+        mix = None
         if self.found is None and self.dtype in kinds and len(kinds) > 1:
-            self.found = func, next(leaf for dtype, leaf in kinds.items() if dtype != self.dtype)
-        return func(*args, **(kwargs or {}))
+            mix = func, next(leaf for dtype, leaf in kinds.items() if dtype != self.dtype)
+        try:
+            result = func(*args, **(kwargs or {}))
+        except MISTAKES:
+            self.found = self.found or mix
+            raise
+        self.found = self.found if self.fail else self.found or mix
+        return result
 
 
 def why(error: Exception, function: Callable[..., Any], *arguments: Any) -> str:
-    """Why a call failed, in one line: the tensor that has another type than x0, if the two meet, else the error's own.
+    """Why a call failed, in one line: the tensor of another type than x0, where the two don't join, else the error's.
 
     The first floating-point tensor of the arguments has the type of x0.
     """
     real = [z for z in arguments if isinstance(z, Tensor) and z.is_floating_point()]
-    if (mismatch := foreign(real[0].dtype, function, *arguments) if real else None) is not None:
+    if (mismatch := foreign(real[0].dtype, function, *arguments, fail=True) if real else None) is not None:
         return mismatch
     return (str(error).splitlines() or [""])[0] or type(error).__name__
 
 
-def foreign(dtype: torch.dtype, function: Callable[..., Any], *arguments: Any) -> str | None:
-    """The first tensor of another floating-point type that the function joins with one of x0's `dtype`, in words."""
-    with suppress(*MISTAKES), _FirstMix(dtype) as mix:
+def foreign(dtype: torch.dtype, function: Callable[..., Any], *arguments: Any, fail: bool = False) -> str | None:
+    """The first tensor of another floating-point type that the function joins with one of x0's `dtype`, in words.
+
+    Args:
+        fail: only where they can't be joined.
+    """
+    with suppress(*MISTAKES), _FirstMix(dtype, fail) as mix:
         function(*arguments)
     if mix.found is None:
         return None

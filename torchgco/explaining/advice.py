@@ -60,6 +60,9 @@ OFF_MAP = (
 )
 OTHER_GOAL = "A goal that no obstacle covers, or a larger radius of it."
 SHORTER_STEPS = 'A smaller dt, or integrator="rk4" where it is another one; of a stiff model integrator="radau5".'
+FINITE_CODE = (
+    "Numbers and code of that part that are finite there, derivatives too: no root or norm at 0, for instance."
+)
 KNOWN_START = (
     "A start where the map knows that it is free; or let unknown cells, which count as occupied, count as free: "
     'DistanceField.of(grid, unknown="free"), on the command line scenario.unknown=free.'
@@ -90,6 +93,7 @@ class Facts:
         missed: by how much a required goal is missed, with its unit; None: it isn't, or isn't required.
         covered: whether one obstacle covers all of a required goal.
         steps: what shows that dt is too long for the model; None: nothing does.
+        lost: which part isn't finite along finite states, and where; None: none, or the states aren't finite.
     """
 
     status: Status
@@ -113,6 +117,7 @@ class Facts:
     body: bool = False
     off_map: str | None = None
     steps: str | None = None
+    lost: str | None = None
 
     @property
     def touches(self) -> bool:
@@ -125,6 +130,8 @@ class Facts:
         """Why the solve ended so, in sentences."""
         if self.unmoved:
             return [OTHER_START]
+        if self.lost is not None:
+            return [self.status.sentence, f"{self.lost}."]
         if self.touches:
             return [TOUCHES]
         if self.flat:
@@ -152,6 +159,8 @@ def advice(facts: Facts) -> list[str]:
         return [KNOWN_START]
     if facts.unmoved:
         return [MOVED]
+    if facts.lost is not None:
+        return [FINITE_CODE]
     if facts.off_map is not None:
         return [OFF_MAP.format(off=facts.off_map)]
     if facts.flat:

@@ -16,7 +16,7 @@ from torchgco.base.tree import PerElement, Rows
 from torchgco.constraints.base import CONTACT_FACTOR
 from torchgco.explaining.advice import Facts, advice, tells_to_record
 from torchgco.explaining.passes import is_pathless, iterations_told, passes_told
-from torchgco.explaining.places import caught_told, gates_told, number, place_told
+from torchgco.explaining.places import caught_told, gates_told, lost_told, number, place_told
 from torchgco.explaining.record import SearchRecord
 from torchgco.judging.judge import columns as judged
 from torchgco.judging.steps import step_errors
@@ -280,6 +280,12 @@ class _One:
         lost = (~torch.isfinite(self.X[0]).all(-1)).nonzero().flatten()
         return int(lost[0]) if lost.numel() else None
 
+    def lost(self, status: Status) -> str | None:
+        """Which part isn't finite, where states and controls are; None where all are."""
+        if status is not Status.NON_FINITE or self.lost_at is not None or not bool(torch.isfinite(self.U).all()):
+            return None
+        return lost_told(self.held, self.full_X, self.full_U, self.t)
+
     @property
     def goal_distance(self) -> float | None:
         problem = self.problem
@@ -325,6 +331,7 @@ def _facts(solved: Solved, b: int, account: Account, single: _One | None) -> Fac
         horizon=None if reached or horizon is None else horizon(single.problem),
         flat=single.lost_at is None and bool(without_slope(single.held, single.full_X, single.full_U, ADMITTED)),
         steps=single.long_steps(),
+        lost=single.lost(status),
         named=single.lost_at is None and place_told(single.problem, single.X, single.U, single.t) is not None,
         **goal_facts(single.problem, single.X, single.U),
         **map_facts(single.problem, status, bool(reached) and (clearance is None or clearance >= 0)),

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import GateSquares
+from torchgco.costs.base import Cost
 from torchgco.judging.gates import passages
 from torchgco.judging.worst import NO_PLACE, kind_of, worst_rows
 from torchgco.problem.problem import Problem
@@ -82,6 +83,32 @@ def place_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str 
     where = knots_told([worst["knot"]], t)
     row = f"{constraint_told(constraint, i)}, {constraint.told(worst['row'], worst['knot'], problem.dynamics)}"
     return f"{row}, {where}, by {number(worst['violation'])}{length}"
+
+
+def lost_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str | None:
+    """The first part that isn't finite along finite X (1, N+1, n), U (1, N, m), and its first knot; None: all are.
+
+    Values come before derivatives.
+    """
+    cost, every, s = problem.cost, torch.arange(X.shape[1], device=X.device), X.shape[-1] + 1 + U.shape[-1]
+    parts: list[tuple[str, Tensor, Tensor]] = []
+    if type(cost).total is Cost.total:
+        with cost.precision(X.dtype):
+            parts.append(("cost.stage", every[:-1], cost.stage(X[:, :-1], U, every[:-1])))
+            parts.append(("cost.terminal", every[-1:], cost.terminal(X[:, -1:])))
+    H = X.new_zeros(1, len(every), s, s)
+    cost.expand(X, U, H)
+    slopes = [("the derivative of the cost", every, H)]
+    for i, row in enumerate(problem.constraints):
+        value, H = row.value(X, U), torch.zeros_like(H)
+        row.accumulate(X, U, torch.ones_like(value), torch.zeros_like(value), H)
+        parts.append((constraint_told(row, i), every[row.knots], value))
+        slopes.append((f"the derivative of {constraint_told(row, i)}", every, H))
+    for name, knots, values in (*parts, *slopes):
+        lost = values.isnan().reshape(len(knots), -1).any(-1)
+        if bool(lost.any()):
+            return f"{name} is NaN at {knots_told([int(knots[lost][0])], t)}"
+    return None
 
 
 def constraint_told(constraint: Constraint, i: int) -> str:

@@ -76,10 +76,11 @@ class Obstacles(Distance):
 
     A kind of obstacles is a subclass with the fields below. It must define
 
-        bind                                  as any constraint; `grown` too, or its chords can't be repaired
+        bind                                  as any constraint
         absent, margins                       which obstacles there are, and their lengths
         signed_distance, segment_clearance    distances of points and of segments
-        measured                              the same by separate code, for the judge and the certificate
+        grown                                 the same obstacles, larger: contact between knots is repaired with it
+        measured                              distances by separate code, for the judge and the certificate
 
     and it may define
 
@@ -203,6 +204,9 @@ class Obstacles(Distance):
 
     def told(self, row: int, knot: int, dynamics: Any) -> str:
         return f"obstacle {row}"
+
+    def grown(self, by: Tensor) -> Self:
+        raise undefined(self, "grown")
 
     def inflated(self) -> Solids | None:
         """The obstacles as spheres or boxes at rest; None where they are neither, and no path is sought."""

@@ -89,18 +89,19 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
     """
     for named in (states_of, controls_of):  # which refuse names and units that aren't one text for each
         named(dynamics)
-    n, rows = dynamics.n, _ends(x0)
-    x, u = _states(x0, 3), _controls(x0, 3, dynamics.m)
+    n, rows = dynamics.n, ends_of(x0)
+    x, u = states_near(x0, 3), _controls(x0, 3, dynamics.m)
     k = torch.arange(3, device=x0.device).clamp(max=N - 1)
     several, single = dynamics.at(k), dynamics.at(0)
     for name in ("field", "step") if dynamics.is_integrated else ("step",):
         method = lambda model, name=name: lambda i, x, u: getattr(model.take(i), name)(x, u)
         what = "derivatives" if name == "field" else "states"
-        wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states"
+        wanted = f"{what} (..., {n}) in {x0.dtype}, the type of x0, shaped as its states (numbers per problem are "
+        wanted += "`batched` or `per_element`)"
         _check_values(f"dynamics.{name}", method(single), rows, (x[:, 0], u[:, 0]), (2, n), wanted)
         _check_among_all(f"dynamics.{name}", method(single), rows, len(x0), (x[:, 0], u[:, 0]))
         of_stages = called(f"dynamics.{name}", wanted, method(several), rows, x, u)
-        _check_tensor(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
+        check_result(f"dynamics.{name}", of_stages, (2, 3, n), x.dtype, wanted)
     _check_stages(dynamics, rows, x0, N)
     weights = 1.0 + 0.5 * scattered(x)
     step = lambda x, u: (weights * several.take(rows).step(x, u)).flatten(1).sum(-1)
@@ -115,7 +116,7 @@ def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
 
 def _check_stages(dynamics: Dynamics, rows: Tensor, x0: Tensor, N: int) -> None:
     """Check that the states after all stages at once are those after each stage."""
-    k, arguments = torch.arange(N, device=x0.device), (_states(x0, N), _controls(x0, N, dynamics.m))
+    k, arguments = torch.arange(N, device=x0.device), (states_near(x0, N), _controls(x0, N, dynamics.m))
 
     def together(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
         return dynamics.at(k).take(i).step(*z)
@@ -139,8 +140,8 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     Raises:
         InputError: as `check_dynamics`.
     """
-    rows, X, U, k = _ends(x0), _states(x0, N + 1), _controls(x0, N, m), torch.arange(N)
-    wanted = f"a number in {x0.dtype}, the type of x0, per state and control"
+    rows, X, U, k = ends_of(x0), states_near(x0, N + 1), _controls(x0, N, m), torch.arange(N)
+    wanted = f"a number in {x0.dtype}, the type of x0, per state and control (numbers per problem are `batched`)"
     stage: Callable[..., Any] = lambda i, x, u, k=k: cost.take(i).stage(x, u, k)
     _check_values("cost.stage", stage, rows, (X[:, :-1], U), (2, N), wanted)
     _check_values("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, (X[:, 0], U[:, 0]), (2,), wanted)
@@ -191,7 +192,7 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
     Raises:
         InputError: as `check_dynamics`.
     """
-    rows, X, U = _ends(x0), _states(x0, N + 1), _controls(x0, N, m)
+    rows, X, U = ends_of(x0), states_near(x0, N + 1), _controls(x0, N, m)
     value = lambda i, X, U: constraint.take(i).value(X, U)
     K = len(torch.arange(N + 1)[constraint.knots])
     if K == 0:
@@ -281,7 +282,7 @@ def _check_values(
         raise InputError(
             field, "a function that leaves its arguments as they are", "one that writes into them in place"
         )
-    _check_tensor(field, both, shape, arguments[0].dtype, wanted)
+    check_result(field, both, shape, arguments[0].dtype, wanted)
     again = called(field, wanted, function, rows, *arguments)
     if not torch.equal(both.nan_to_num(), again.nan_to_num()):
         raise InputError(field, "the same values for the same arguments", "others at a second call: it draws at random")
@@ -289,7 +290,7 @@ def _check_values(
         return both.shape
     for i in (0, 1):
         alone = called(field, OWN_ROW, function, rows[i : i + 1], *(z[i : i + 1] for z in arguments))
-        _check_tensor(field, alone, (1, *both.shape[1:]), both.dtype, OWN_ROW)
+        check_result(field, alone, (1, *both.shape[1:]), both.dtype, OWN_ROW)
         if bool(unlike(alone, both[i : i + 1]).any()):
             raise InputError(field, OWN_ROW, "other values for a problem alone than beside another one")
     return both.shape
@@ -325,7 +326,7 @@ def _check_axes(field: str, function: Callable[..., Tensor], takes_k: bool, k: T
         raise InputError(field, ANY_AXES, "others for a state by itself, and its k, than among those of all knots")
 
 
-def _check_tensor(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
+def check_result(field: str, value: Any, shape: tuple[int | None, ...], dtype: torch.dtype, wanted: str) -> None:
     fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.dtype == dtype
     if not fits or any(want not in (None, got) for want, got in zip(shape, value.shape, strict=True)):
         sizes = ", ".join("p" if size is None else str(size) for size in shape)
@@ -375,14 +376,14 @@ def called(field: str, wanted: str, function: Callable[..., Any], *arguments: An
         raise InputError(field, wanted, why(error, function, *arguments)) from theirs(error)
 
 
-def _ends(x0: Tensor) -> Tensor:
+def ends_of(x0: Tensor) -> Tensor:
     """The first and the last problem, (2,) int64."""
     return torch.tensor([0, x0.shape[0] - 1], device=x0.device)
 
 
-def _states(x0: Tensor, K: int) -> Tensor:
+def states_near(x0: Tensor, K: int) -> Tensor:
     """States (2, K, n) close to the first and the last start; no two of them are equal."""
-    x = x0[_ends(x0)].unsqueeze(1).repeat(1, K, 1)
+    x = x0[ends_of(x0)].unsqueeze(1).repeat(1, K, 1)
     x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
     return x + OFFSET * (1.0 + x.abs()) * (1.0 + 0.5 * scattered(x))
 

@@ -6,6 +6,7 @@ for gradients, its parts are bound once more, with gradients recorded, when a so
 
 from __future__ import annotations
 
+import inspect
 import zlib
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
@@ -22,9 +23,10 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from torchgco.base.errors import InputError, shown
 from torchgco.base.gradients import asking, leaves, recording, without_gradients
+from torchgco.base.options import check_value
 from torchgco.base.shapes import Dimensions, as_states, check_untransformed, describe
 from torchgco.base.tree import is_users
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, Sense
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles
@@ -188,6 +190,7 @@ COMPUTED = (
     "expand", "scaled", "value", "rows", "accumulate", "violation", "worst", "at", "signed_distance",
     "segment_clearance", "chord_clearance", "jacobians",
 )  # fmt: skip
+RESERVED = "bare", "body", "has_chords", "inscribed", "kernel", "map"  # names that no user's class may have
 INTERFACES = Cost, Constraint, Obstacles, Dynamics  # what these compute, they compute by a part's own methods
 
 
@@ -197,8 +200,12 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
     Raises:
         InputError: `bind` returns another kind of thing, or one of torchgco's own classes that doesn't do what the
             user's class does: a subclass of `QuadraticCost`, say, whose `stage` would never be called. Or a user's
-            class has one method of its own and inherits another that doesn't know it, such as `stage` and `expand`.
+            class has one method of its own and inherits another that doesn't know it, such as `stage` and `expand`. Or
+            it has something else by a name that torchgco's class has, such as a number by that of a method.
     """
+    for name, heir, meant in _shadowed(part):
+        expected = f"another name: by this one {heir} means {meant}"
+        raise InputError(f"{field}.{name}", expected, f"one of {type(part).__name__}")
     result = part.bind(dims)
     if not isinstance(result, kind):
         raise InputError(f"{field}.bind", f"a method that returns a {kind.__name__}", describe(result))
@@ -206,6 +213,7 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
         knots = getattr(result, "knots", None)
         if not isinstance(knots, slice) and not (isinstance(knots, Tensor) and knots.dtype == torch.int64):
             raise InputError(f"{field}.knots", "a slice or an int64 tensor (K,), which `bind` sets", shown(knots))
+        check_value(result.sense, Sense, f"{field}.sense")
     for name in _lost(part, result):
         expected = f"a class whose own methods are called: {type(result).__name__} takes its place"
         raise InputError(f"{field}.{name}", expected, f"one of {type(part).__name__}")
@@ -255,6 +263,25 @@ def _lost(part: Any, result: Any) -> Iterator[str]:
                 continue
             if hasattr(type(result), name) and getattr(type(result), name) is not value:
                 yield name
+
+
+def _shadowed(part: Any) -> Iterator[tuple[str, str, str]]:
+    """Names of a user's class by which one of ours means something else: this class, and what it means."""
+    line = type(part).__mro__
+    named = {name: None for cls in line if not _is_ours(cls) for name in (*vars(cls), *inspect.get_annotations(cls))}
+    for name in named:
+        ours = next((cls for cls in line if _is_ours(cls) and name in vars(cls)), None)
+        if ours is None or name.startswith("_"):
+            continue
+        if name in RESERVED:
+            yield name, ours.__name__, "something of its own"
+        meant, used = vars(ours)[name], inspect.getattr_static(part, name)
+        if meant is not None and _is_method(meant) != _is_method(used):
+            yield name, ours.__name__, "a method" if _is_method(meant) else "a property or a value"
+
+
+def _is_method(value: object) -> bool:
+    return callable(value) or isinstance(value, (staticmethod, classmethod))
 
 
 def _torn(result: Any) -> Iterator[tuple[str, str, str]]:

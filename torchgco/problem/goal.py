@@ -19,6 +19,7 @@ from torchgco.constraints.base import Constraint, whole
 from torchgco.constraints.norms import NormBounds
 from torchgco.costs.base import Cost
 from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.border import called
 
 AXES = "xyz"
 RADIUS_SHARE = 0.09  # radius of a goal that is derived from a cost, as a share of the distance from start to goal
@@ -250,7 +251,11 @@ def bound_goal(goal: Goal | None, cost: Cost, dims: Dimensions) -> tuple[Goal | 
         InputError: see `Goal`.
     """
     stated = goal is not None and not goal.assumed
-    bound = goal.bind(dims) if stated else Goal.derived(cost.goal(dims.like), dims)  # type: ignore[union-attr]
+    if stated:
+        bound = goal.bind(dims)  # type: ignore[union-attr]
+    else:
+        place = called("cost.goal", f"{dims.like.dtype} states {tuple(dims.like.shape)}, or None", cost.goal, dims.like)
+        bound = Goal.derived(place, dims)
     return bound, dims if bound is None else replace(dims, goal=bound.position)
 
 

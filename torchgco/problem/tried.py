@@ -12,7 +12,9 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchgco.base.memory import trim
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import is_users
+from torchgco.obstacles.base import Obstacles
 from torchgco.problem.border import check_constraint, check_cost, check_dynamics
+from torchgco.problem.distances import check_distances
 from torchgco.tracing import CAPTURED, Facts, Unseen
 
 Given: TypeAlias = tuple[Any, Any]  # a part as the user gave it, and bound to a problem
@@ -41,7 +43,7 @@ def check_code(
         dynamics, cost, constraints: each as the user gave it and bound to the problem; those that are new.
 
     Raises:
-        InputError: as `check_dynamics`, `check_cost`, `check_constraint`.
+        InputError: as `check_dynamics`, `check_cost`, `check_constraint`, `check_distances`.
     """
     where = dims.position and (dims.position.start, dims.position.stop)
     about = dims.B, dims.N, dims.n, dims.m, dims.dt, where, dims.obstacles_from, x0.dtype, x0.device
@@ -52,11 +54,17 @@ def check_code(
     for i, constraint in enumerate(constraints):
         name = getattr(constraint[1], "name", None)
         field = f"{name}.function" if isinstance(name, str) else f"constraints[{i}].value"
-        _check_once(constraint, about, lambda bound, field=field: check_constraint(bound, field, x0, dims.N, dims.m))
+        _check_once(constraint, about, lambda bound, i=i, field=field: _check_row(bound, i, field, x0, dims))
+
+
+def _check_row(bound: Any, i: int, field: str, x0: Tensor, dims: Dimensions) -> None:
+    if isinstance(bound, Obstacles) and is_users(bound.inscribed):
+        check_distances(bound.inscribed, f"constraints[{i}]", x0, dims.N)
+    check_constraint(bound, field, x0, dims.N, dims.m)
 
 
 def _check_once(pair: Given, about: Hashable, check: Callable[[Any], None]) -> None:
-    if not is_users(pair[1]):
+    if not is_users(pair[1]) and not is_users(getattr(pair[1], "inscribed", pair[1])):
         return
     if not any(part in _passed and about in _passed[part] for part in pair):
         facts = _facts_of(pair[0])
