@@ -239,20 +239,20 @@ class _Differences:
     def of_both_orders(self) -> Tensor:
         problem, n = self.problem, self.problem.n
         held, U = within_horizons(problem), at_rest_after(problem, self.U)
+        whole = at_times(held, self.X, U, self.times)
         try:
             by_x, by_u = _slopes(held, self.X, U, self.times, self.multipliers or ())
             F = _half_steps(problem, self.X[:, :-1], U, self.e, self.times)
-        except RuntimeError:  # code that autograd can't differentiate, which samplers serve
+            H = _curvatures(problem, *whole, self.multipliers)
+        except RuntimeError:  # code that autograd can't differentiate twice, as that of samplers
             return torch.full_like(self.X[:, 0, 0], torch.nan)
         if self.slopes is not None:  # of a phase, which doesn't know what follows
             by_x[:, -1] = self.slopes[:, -1, :n]
-        whole, X, U = at_times(held, self.X, U, self.times)
-        H = _curvatures(problem, whole, X, U, self.multipliers)
         H[:, :, :n, n] = H[:, :, n, :n] = by_x
         H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
         first, second = _answered(F, H, self.multipliers is not None)
         change = first.abs() + second.clamp(min=0.0) / (1.0 - 0.5 ** ORDER_OF[problem.dynamics.integrator])
-        return torch.where(change != 0, change / _size(whole, X, U), 0.0)
+        return torch.where(change != 0, change / _size(*whole), 0.0)
 
 
 def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:

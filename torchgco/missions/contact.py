@@ -46,9 +46,8 @@ class Contact(PerElement):
         for solid in solids:
             if type(solid).measured is Obstacles.measured:
                 raise InputError("constraints", "obstacles that say their distances, `measured`", type(solid).__name__)
-        maps = [solid.map is not None for solid in solids]  # flown at 0.95 of the radius, too
-        shrunk = (solid.grown(ADMITTED - TOUCH * solid.vehicle_radius) for solid in solids)
-        solids = tuple(less if is_map else solid for less, is_map, solid in zip(shrunk, maps, solids, strict=True))
+        less = lambda solid: solid.grown(ADMITTED - TOUCH * solid.vehicle_radius)
+        solids = tuple(solid if solid.map is None else less(solid) for solid in solids)  # maps at 0.95 of it, too
         return cls(solids, airframe_of(problem.dynamics) if any(solid.body is not None for solid in solids) else None)
 
     @property
