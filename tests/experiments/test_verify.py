@@ -186,7 +186,7 @@ def test_rows_that_are_missing_or_twice_are_refused(out, capsys) -> None:
 
 @pytest.mark.slow
 def test_several_studies_and_their_report(out, capsys, monkeypatch) -> None:
-    monkeypatch.setattr("torchgco.experiments.reports.report._figures", lambda parts: {})
+    monkeypatch.setattr("torchgco.experiments.reports.report.drawings", lambda part: {})
     shutil.copytree(out, out.parent / "second")
     assert main([str(out.parent)]) == 0
     capsys.readouterr()

@@ -65,7 +65,7 @@ def _logged(path: Path, trust: bool) -> tuple[Tensor, Tensor, float]:
     parts = [flight for _, flight in read_table(path, trust).groupby(["solver", "mission"], sort=False)]
     dt = float(parts[0]["t"].iloc[1] - parts[0]["t"].iloc[0])
     named = [f"x{i}" for i in range(17)], [f"u{i}" for i in range(1, 5)]
-    sequences = ([torch.from_numpy(flight[names].to_numpy(float)) for flight in parts] for names in named)
+    sequences = ([torch.from_numpy(flight[names].to_numpy(float, copy=True)) for flight in parts] for names in named)
     x, u = (pad_sequence(flights, batch_first=True, padding_value=torch.nan) for flights in sequences)
     return x, u[:, :-1], dt
 
