@@ -42,8 +42,8 @@ class GateForest(Quadrotor):
     Args:
         goal: without meaning here: it is drawn.
         stages: of each leg.
-        integrator: of the quadrotor: Euler's steps, of which the durations would be 1.5 % too long, lead metres past
-            the gates.
+        integrator: of the quadrotor: Euler's steps, of which the durations would be 1 to 3 % too long, lead a metre
+            or two past the gates.
         num_gates: [least, most] of a layout, any of these alike.
         gate_radius: m.
         spacing: [least, largest] distance from gate to gate, in the plane, m.
