@@ -169,10 +169,8 @@ def test_files_and_functions_are_short() -> None:
                 assert node.end_lineno - node.lineno <= 65, f"{node.name} in {path.name}"
 
 
-# Files of the package that name a kind, at most: what else there is to know of it, the kind says itself. Pictures hand
-# a vehicle's body on.
+# Files of the package that name a kind, at most: what else there is to know of it, the kind says itself.
 NAMED_IN = 6
-NAMED_MORE = {"BoundBody": 9}
 ROOMS_OF_KINDS = "constraints", "obstacles", "costs", "maps/field.py", "problem/goal.py"
 
 
@@ -208,5 +206,5 @@ def test_kinds_are_known_in_few_files() -> None:
             for name in kinds.intersection(named):
                 files[name].add(str(path.relative_to(PACKAGE)))
     bases = {"Constraint", "Cost", "Distance", "Obstacles", "OwnKind", "Vectors", "Bounds"}
-    many = {kind: sorted(found) for kind, found in files.items() if len(found) > NAMED_MORE.get(kind, NAMED_IN)}
+    many = {kind: sorted(found) for kind, found in files.items() if len(found) > NAMED_IN}
     assert not {kind: found for kind, found in many.items() if kind not in bases}

@@ -36,8 +36,8 @@ from torchgco.kernels import use_native
 from torchgco.maps import PointCloud
 from torchgco.obstacles.base import Obstacles
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import balls_at, silhouettes
 from torchgco.plotting.scene import world_of
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.problem.horizons import for_solvers
 from torchgco.roadmap.geometry import scene_of
 from torchgco.search.nearby import Nearby
@@ -306,7 +306,8 @@ def test_pictures_show_the_balls() -> None:
     """They stand for the vehicle: obstacles aren't grown by a radius, and contacts are those of the balls."""
     problem, X, _ = problem_of(2, kinds(2)["boxes"])
     world = world_of(problem, 1)
-    centers, radii = balls_at(world.body, X[1].numpy())
+    assert world.body is not None
+    centers, radii = world.body.balls(X[1].numpy()), world.body.radii
     assert world.first.margin == 0.0 and radii.tolist() == ROD.radii.tolist() and centers.shape == (9, 3, 2)
     x = X[1, 4].numpy()
     np.testing.assert_allclose(centers[4, 2], x[:2] + turned(2, x) @ ROD.offsets[2].numpy(), atol=1e-12)
@@ -391,15 +392,15 @@ def test_c_solves_bodies_with_parts_as_pytorch_does() -> None:
 
 def test_pictures_show_the_parts() -> None:
     world = world_of(jointed(kinds(2)["spheres"]), 0)
-    assert world.body is not None and world.body.fixed == 2
+    assert world.body is not None and len(world.body.offsets) == 2
     states = np.random.default_rng(7).normal(0, 1, (3, 6))
-    rings = silhouettes(world.body, states, (0, 1))
+    rings = world.body.outlines(states, (0, 1))
     middles = [ring.mean(0) for ring in rings]
     np.testing.assert_allclose(middles, np.concatenate([by_hand(x) for x in states]), atol=0.02)
     box = Body.covering([-0.3, -0.2], [0.3, 0.2], [2, 1], "yaw")
     covered = replace(box, parts=TRUCK.parts)
-    outlines = silhouettes(jointed(kinds(2)["spheres"], covered).constraints[0], states, (0, 1))
-    assert len(outlines) == 3 + 3 * 3
+    hitched = VehicleBody.of(jointed(kinds(2)["spheres"], covered))
+    assert hitched is not None and len(hitched.outlines(states, (0, 1))) == 3 + 3 * 3
 
 
 @pytest.mark.parametrize("make, line", [

@@ -17,8 +17,9 @@ from torchgco.dynamics.quadrotor import Airframe
 from torchgco.maps import DistanceField, OccupancyGrid
 from torchgco.missions.outcome import Outcome
 from torchgco.plotting import missions
-from torchgco.plotting.bodies import Ball, Box, body_of
+from torchgco.plotting.bodies import Ball, Box
 from torchgco.plotting.course import Course
+from torchgco.plotting.vehicle_body import VehicleBody
 
 STEPS, KNOTS, PERIOD = 12, 6, 0.05
 
@@ -56,7 +57,7 @@ def test_a_body_counts_by_its_balls_as_they_are_turned() -> None:
     rest = torch.zeros(1, 14, dtype=torch.float64)
     rest[0, 6] = 1.0
     cost = QuadraticCost([1.0] * 14, [1.0] * 4, [1.0] * 14)
-    held = body_of(Problem(QuadrotorPlanning(), cost, [body], rest, 3))
+    held = VehicleBody.of(Problem(QuadrotorPlanning(), cost, [body], rest, 3))
     ball = Ball(np.array([2.0, 1.0, 0.0]), 0.3, np.zeros(3))
     drawn = Course((ball,), np.array([6.0, 0.0, 0.0]), 0.5, vehicle_radius=0.2, body=held)
     states = pd.DataFrame({f"x{i}": np.zeros(9) for i in range(13)} | {"t": PERIOD * np.arange(9)})

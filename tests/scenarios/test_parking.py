@@ -11,8 +11,8 @@ from matplotlib.collections import PolyCollection
 from tests.trials import flights, trials
 from torchgco import Bicycle, InputError, compose
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import body_of
 from torchgco.plotting.layouts import layout_grid
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.problem.goal import GoalState
 from torchgco.scenarios import Layouts, Parking, concatenate
 from torchgco.search.poses import clear_at
@@ -83,7 +83,7 @@ def test_pictures_show_the_rectangle() -> None:
     """In the pose of the car, and contacts are those of its body."""
     setup = compose(["scenario=parking"])
     layouts = setup.layouts(1)
-    body = body_of(setup.task(layouts).problem)
+    body = VehicleBody.of(setup.task(layouts).problem)
     X = np.zeros((1, 5, 5))
     X[0] = np.linspace(layouts.start[0], [-1.3, -0.6, 0.3, 0, 0], 5)
     rows = trials(*flights("gco", [False])).assign(scenario="parking", model="car")

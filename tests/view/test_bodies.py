@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 import torchgco
 from tests.view.browser import Tab
 from torchgco import Body, Boxes, Goal, Problem, QuadraticCost, QuadrotorPlanning, Spheres, Unicycle
-from torchgco.plotting.bodies import body_of
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.view.shapes import shapes_of
 from torchgco.view.vehicles import shape_of, turned
 
@@ -34,12 +34,12 @@ def test_a_body_turns_the_vehicle() -> None:
     X = np.array([[0.0, 0.0, 2.5, 0.0], [1.0, 0.0, -0.4, 0.0]])
     by_function = Body([[0.2, 0.0], [0.0, 0.1]], 0.1, lambda x: quarter(x[..., 2]))
     for body, more in ((Body([[0.2, 0.0], [0.0, 0.1]], 0.1), 0.0), (by_function, np.pi / 2)):
-        held = body_of(drive(body))
+        held = VehicleBody.of(drive(body))
         assert held is not None
         q = Rotation.from_quat(turned(held, X)[:, [1, 2, 3, 0]])
         np.testing.assert_allclose(q.apply([1.0, 0, 0])[:, 0], np.cos(X[:, 2] + more), atol=1e-12)
         np.testing.assert_allclose(q.apply([1.0, 0, 0])[:, 1], np.sin(X[:, 2] + more), atol=1e-12)
-    flat = body_of(drive(Body([[0.2, 0.0], [0.0, 0.1]], 0.1)))
+    flat = VehicleBody.of(drive(Body([[0.2, 0.0], [0.0, 0.1]], 0.1)))
     assert flat is not None and turned(flat, np.zeros((2, 4))).tolist() == [[1, 0, 0, 0]] * 2
 
 
@@ -56,7 +56,7 @@ def test_a_quaternion_turns_a_body_in_space() -> None:
     problem = Problem(QuadrotorPlanning(), cost, [Spheres([[9.0, 0, 0]], [1.0], body)], x0, 4)
     X = np.zeros((3, 14))
     X[:, 6:10] = np.random.default_rng(0).normal(size=(3, 4))
-    held = body_of(problem)
+    held = VehicleBody.of(problem)
     assert held is not None
     turns = Rotation.from_quat(turned(held, X)[:, [1, 2, 3, 0]]).as_matrix()
     np.testing.assert_allclose(turns, Rotation.from_quat(X[:, [7, 8, 9, 6]]).as_matrix(), atol=1e-12)

@@ -17,7 +17,7 @@ from matplotlib.patches import Circle, Polygon
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.animation import PALE
-from torchgco.plotting.bodies import Plane, silhouettes
+from torchgco.plotting.bodies import Plane
 from torchgco.plotting.layouts import ROCK
 from torchgco.plotting.problems import WIDTH, Course, Leg, SceneMap, in_one_box, is_shared
 from torchgco.plotting.scene import World, distances
@@ -157,5 +157,5 @@ def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float, is_
         if not np.isfinite(state).all():
             return drawn
         look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}
-        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in silhouettes(world.body, state, plane)]
+        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in world.body.outlines(state, plane)]
     return drawn

@@ -17,13 +17,13 @@ from matplotlib.patches import Circle
 from torchgco.base.errors import InputError
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import ADMITTED
-from torchgco.obstacles.body import BoundBody
 from torchgco.plotting import trajectory as draw
-from torchgco.plotting.bodies import Ball, Solid, balls_at, silhouettes
+from torchgco.plotting.bodies import Ball, Solid
 from torchgco.plotting.gates import Outline, draw_gates
 from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Scene, contacts, view
 from torchgco.plotting.style import INK, PALETTE
+from torchgco.plotting.vehicle_body import VehicleBody
 
 VEHICLE_COLOUR = PALETTE[5]
 VIEWS: tuple[draw.Plane, draw.Plane] = (draw.ABOVE, draw.SIDE)
@@ -59,7 +59,7 @@ class Course:
     vehicle_radius: float = 0.36
     map: DistanceField | None = None
     gates: tuple[Outline, ...] = ()
-    body: BoundBody | None = None
+    body: VehicleBody | None = None
 
     def __post_init__(self) -> None:
         if np.shape(self.goal) != (3,):
@@ -76,7 +76,7 @@ class Course:
 
         Of a box, r_obs is the radius that rounds it, of a map, the last one, 0.
         """
-        radii = [self.vehicle_radius] if self.body is None else self.body.radii[0].tolist()
+        radii = [self.vehicle_radius] if self.body is None else self.body.radii.tolist()
         return np.concatenate([self._reaches(radius) for radius in radii])
 
     def _reaches(self, radius: float) -> np.ndarray:
@@ -95,7 +95,7 @@ class Course:
 
     def nearness(self, track: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Smallest of `distances` as a share of r_obs + r_veh, (T,), at times t (T,), s; inf without obstacles."""
-        balls = [track] if self.body is None else list(balls_at(self.body, track)[0].swapaxes(0, 1))
+        balls = [track] if self.body is None else list(self.body.balls(track).swapaxes(0, 1))
         away = np.concatenate([self.distances(ball, t) for ball in balls])
         return (away / self.reaches[:, None]).min(axis=0, initial=np.inf)
 
@@ -109,7 +109,7 @@ class Course:
 
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of a box around goal and track, a little wider where obstacles are."""
-        reach = self.vehicle_radius if self.body is None else float(self.body.reach[0])
+        reach = self.vehicle_radius if self.body is None else self.body.reach
         ways = [track[:, :3] + side * reach for side in (-1.0, 1.0)]
         low, high = view(self._scene(track[:1]), [0], ways, [])
         return low, high
@@ -143,7 +143,7 @@ def draw_instant(
     draw_contacts(ax, course.contacts(track, period), plane)
     look: dict[str, Any] = {"facecolor": VEHICLE_COLOUR, "edgecolor": INK, "linewidth": 0.8, "zorder": 6}
     if course.body is not None:
-        ax.add_collection(PolyCollection(silhouettes(course.body, track[-1:], plane), **look), autolim=False)
+        ax.add_collection(PolyCollection(course.body.outlines(track[-1:], plane), **look), autolim=False)
         return
     ax.add_patch(Circle((float(track[-1, plane[0]]), float(track[-1, plane[1]])), course.vehicle_radius, **look))
 

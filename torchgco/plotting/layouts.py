@@ -18,12 +18,12 @@ from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
 from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid, draw_body, extent
+from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
 from torchgco.plotting.gates import draw_gates
 from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, distances, flown, leaving, passes, scene_of, view
 from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, grid, put_head, solver_colours, solver_dash, tasks_of
+from torchgco.plotting.vehicle_body import VehicleBody
 
 ROCK = "#CFC8BA"
 TALLEST = 1.5  # heights of a panel as a share of its width
@@ -54,7 +54,7 @@ def layout_grid(
     trials: pd.DataFrame,
     columns: int | None = None,
     rows: int = 3,
-    body: BoundBody | None = None,
+    body: VehicleBody | None = None,
     position: slice | None = None,
     obstacles: Sequence[Sequence[Obstacles]] | None = None,
 ) -> Figure:
@@ -148,7 +148,7 @@ def views(scene: Scene, flights: Mapping[str, list[DrawnFlight]], count: int, co
         here = [row[i] for row in flights.values() for i in shown]
         whole = [flown(flight.path) for flight in here if not flight.end]
         if scene.body is not None:
-            whole += [extent(scene.body, flight.states) for flight in here if not flight.end]
+            whole += [scene.body.extent(flight.states) for flight in here if not flight.end]
         boxes.append(view(scene, shown, whole, [flown(flight.path) for flight in here if flight.end]))
     low, high = min(box[0, 0] for box in boxes), max(box[1, 0] for box in boxes)
     tallest = max(float(np.ptp(box, axis=0)[1:].max()) for box in boxes)
@@ -280,7 +280,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], p
             wide = 1.6 if level == len(flights) - 1 else 2.2
             ax.plot(*path[:, plane].T, linewidth=wide, linestyle=solver_dash(solver), **look)
             if scene.body is not None and level == len(flights) - 1:
-                draw_body(ax, scene.body, flight.states, plane, colours[solver], 2.0)
+                scene.body.draw(ax, flight.states, plane, colours[solver], 2.0)
                 drawn.add("body")
         away = leaving(np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
         ended = _ended(flight, away is not None)

@@ -22,7 +22,7 @@ from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.judging.contact import contacts
 from torchgco.obstacles.base import ADMITTED
-from torchgco.plotting.bodies import ABOVE, SIDE, Plane, draw_body, extent
+from torchgco.plotting.bodies import ABOVE, SIDE, Plane
 from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import (
     MARKED,
@@ -247,7 +247,7 @@ class SceneMap:
             for scene in world.scenes:
                 inside += moving_corners(scene, 0, course.paths[0])
             if world.body is not None and course.keeps:
-                inside.append(extent(world.body, course.X[: len(flown(course.paths[0]))]))
+                inside.append(world.body.extent(course.X[: len(flown(course.paths[0]))]))
         inside += [corners + sign * radius for corners, radius in gates for sign in (-1.0, 1.0)]
         points = np.concatenate(inside)
         box = np.stack([points.min(axis=0), points.max(axis=0)])
@@ -319,7 +319,7 @@ class SceneMap:
                 drawn.add("away")
         states = course.X[: len(flown(course.paths[0]))]
         if self.world.body is not None:
-            draw_body(ax, self.world.body, states, plane, course.colour)
+            self.world.body.draw(ax, states, plane, course.colour)
             drawn.add("body")
         if not course.touches:
             return drawn

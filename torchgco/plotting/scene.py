@@ -13,8 +13,8 @@ from torchgco.judging import contact
 from torchgco.judging.contact import deepest, map_depth, pieces
 from torchgco.maps.distance import DistanceField
 from torchgco.obstacles.base import CONTACT_FACTOR, Obstacles
-from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import Plane, Solid, balls_at, bodies, body_of, solids
+from torchgco.plotting.bodies import Plane, Solid, bodies, solids
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.problem.problem import Problem
 from torchgco.scenarios.layouts import map_of
 
@@ -53,7 +53,7 @@ class Scene:
     ids: np.ndarray
     map: DistanceField | None = None
     gates: np.ndarray | None = None
-    body: BoundBody | None = None
+    body: VehicleBody | None = None
     position: slice | None = None
     sized: bool = True
     obstacles: tuple[tuple[Obstacles, ...], ...] | None = None
@@ -82,7 +82,7 @@ class Pass(NamedTuple):
 
 def scene_of(
     layouts: Arrays,
-    body: BoundBody | None = None,
+    body: VehicleBody | None = None,
     position: slice | None = None,
     obstacles: Sequence[Sequence[Obstacles]] | None = None,
 ) -> Scene:
@@ -174,8 +174,8 @@ def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None =
         return deepest(places, depth)
     balls = [(places, scene.margin)]
     if scene.body is not None and states is not None:
-        centers, radii = balls_at(scene.body, pieces(states[: len(flown(path))])[0])
-        balls = [(centers[:, p], float(radius)) for p, radius in enumerate(radii)]
+        centers = scene.body.balls(pieces(states[: len(flown(path))])[0]).swapaxes(0, 1)
+        balls = list(zip(centers, scene.body.radii.tolist(), strict=True))
     for ball, margin in balls:
         for body in scene.bodies[i]:
             reach = CONTACT_FACTOR * (body.radius + margin)
@@ -265,7 +265,7 @@ class World:
     scenes: tuple[Scene, ...]
     others: tuple[Obstacles, ...]
     obstacles: tuple[Obstacles, ...]
-    body: BoundBody | None = None
+    body: VehicleBody | None = None
 
     @property
     def first(self) -> Scene:
@@ -301,7 +301,7 @@ def world_of(problem: Problem, b: int) -> World:
         for vehicle, bodies in (by_radius or none).items()
     ]
     scenes += [Scene(((),), start, goal, vehicle, radius, dt, np.array([b]), field) for vehicle, field in maps]
-    return World(tuple(scenes), tuple(others), tuple(single.obstacles), body_of(single))
+    return World(tuple(scenes), tuple(others), tuple(single.obstacles), VehicleBody.of(single))
 
 
 def distances(part: Obstacles, box: np.ndarray, plane: Plane, z: float, t: float = 0.0) -> tuple[np.ndarray, ...]:

@@ -18,13 +18,13 @@ from matplotlib.ticker import PercentFormatter
 
 from torchgco.base.errors import InputError
 from torchgco.obstacles.base import Obstacles
-from torchgco.obstacles.body import BoundBody
 from torchgco.plotting.bodies import ABOVE
 from torchgco.plotting.layouts import draw_layout, ends, ends_shown, flights_of, views
 from torchgco.plotting.maps import map_handles
 from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
 from torchgco.plotting.style import INK, TEXT, legend_columns, solver_colours, solver_dash, tidy
+from torchgco.plotting.vehicle_body import VehicleBody
 
 Columns = Literal["one", "two"]
 COSTLIEST = 2.0  # times the best known cost, where the axis of costs ends
@@ -61,7 +61,7 @@ def study_figure(
     trials: pd.DataFrame,
     summary: pd.DataFrame,
     columns: Columns = "two",
-    body: BoundBody | None = None,
+    body: VehicleBody | None = None,
     position: slice | None = None,
     obstacles: Sequence[Sequence[Obstacles]] | None = None,
 ) -> Figure:

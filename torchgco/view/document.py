@@ -15,9 +15,9 @@ from torchgco.base.version import VERSION
 from torchgco.judging.contact import contacts
 from torchgco.judging.worst import kind_of
 from torchgco.obstacles.base import Obstacles
-from torchgco.plotting.bodies import body_of
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST_HALF, Packing, number
 from torchgco.view.sensed import Sensed
@@ -168,7 +168,7 @@ def flights_of(
     """
     (violation, worst), flights = violated(problem, X, U, admitted), []
     dt = getattr(problem.dynamics, "dt", None) or 1.0
-    states, body = X.detach().cpu().double().numpy(), body_of(problem)
+    states, body = X.detach().cpu().double().numpy(), VehicleBody.of(problem)
     for b in range(problem.B):
         kept = whole(states[b])
         path, knots = kept[:, problem.position], slice(0, len(kept))

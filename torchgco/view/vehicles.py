@@ -15,8 +15,7 @@ import numpy as np
 from torchgco.dynamics import Bicycle, Dynamics, QuadrotorPlanning, QuadrotorPlant, QuadrotorThrusts, Unicycle
 from torchgco.dynamics.names import states_of
 from torchgco.obstacles.attitude import QUATERNION
-from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.bodies import body_of, rotations
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.problem.problem import Problem
 from torchgco.view.shapes import NOT_TURNED, turns
 
@@ -109,17 +108,17 @@ class Shape:
 
 def shape_of(problem: Problem) -> Shape | None:
     """The body of a problem's vehicle, without parts that turn by themselves; None where it is a ball."""
-    if (body := body_of(problem)) is None:
+    if (body := VehicleBody.of(problem)) is None:
         return None
-    offsets, radii = (values[0, : body.fixed].cpu().double().numpy() for values in (body.points.offsets, body.radii))
+    offsets = body.offsets
+    radii = body.radii[: len(offsets)]
     balls = np.column_stack((offsets, np.zeros((len(offsets), 3 - offsets.shape[1])), radii))
-    box = None if body.box is None else np.array(body.box)
-    return Shape(balls, box, float((np.linalg.norm(offsets, axis=1) + radii).max()))
+    return Shape(balls, body.box, float((np.linalg.norm(offsets, axis=1) + radii).max()))
 
 
-def turned(body: BoundBody, X: np.ndarray) -> np.ndarray:
+def turned(body: VehicleBody, X: np.ndarray) -> np.ndarray:
     """Quaternions (K, 4) by which a body is turned in states X (K, n)."""
-    axes = rotations(body, X).swapaxes(-1, -2)
+    axes = body.rotations(X).swapaxes(-1, -2)
     quaternions = turns(axes)
     if quaternions is None:
         return np.tile(NOT_TURNED, (len(axes), 1))

@@ -49,7 +49,7 @@ from torchgco.missions.planning_problem import airframe_of
 from torchgco.obstacles.base import Obstacles
 from torchgco.plotting import missions as of_missions
 from torchgco.plotting.animation import mission_animation
-from torchgco.plotting.bodies import bodies, body_of
+from torchgco.plotting.bodies import bodies
 from torchgco.plotting.course import Course
 from torchgco.plotting.distributions import clearance_figure, is_spread, violation_figure
 from torchgco.plotting.families import families_figure
@@ -59,6 +59,7 @@ from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
+from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
@@ -123,7 +124,7 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
     groups = layouts.alike()
     made = [tasks.of(places, exact=True) for places in groups]  # the first of the study's own
     first, arrays = made[0].problem, tasks.setup.vehicle.completed(layouts).arrays()
-    how = {"body": body_of(first), "position": first.dynamics.position}
+    how = {"body": VehicleBody.of(first), "position": first.dynamics.position}
     if first.dynamics.position is None:
         return arrays, how
     start, goal = (np.full((layouts.count, layouts.dimension), np.nan) for _ in range(2))
@@ -361,8 +362,8 @@ def _course(tasks: Tasks, number: int) -> tuple[Course, float]:
     stated = layouts.vehicle_radius
     vehicle = setup.vehicle.radius if stated is None else stated
     gates = tuple(outlines(task.problem, 0))
-    if (body := body_of(task.problem)) is not None:
-        vehicle = float(body.inner.vehicle_radius[0])
+    if (body := VehicleBody.of(task.problem)) is not None:
+        vehicle = body.inner
     course = Course(bodies(layouts.arrays(), 0), task.goal[0].numpy(), radius, vehicle, layouts.map, gates, body)
     return course, float(task.problem.dynamics.dt)
 
