@@ -1,7 +1,8 @@
 """python -m benchmarks.export: bytes, code and instructions of exported C on a Cortex-M7, emulated by QEMU.
 
 Each controller makes the periods of its own test: the first from rest, the others warm, 0.1 % beside the plan before.
-It needs Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm. Instructions are counted by a timer of
+It needs Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi, libstdc++-arm-none-eabi-newlib and qemu-system-arm, and
+`pip install --no-deps tinympc`. Instructions are counted by a timer of
 the board at one instruction per 64 ns of emulated time; an emulator knows no cycles.
 """
 
@@ -11,13 +12,14 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.export_peers import HESSIANS, arrays, write_sqp, write_tiny
 from benchmarks.lib import ROOT
 from benchmarks.lib.command import Command
 from benchmarks.lib.page import markdown
@@ -31,6 +33,8 @@ BOARDS = {
     torch.float64: ("mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-d16", *THUMB)),
     torch.float32: ("mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *THUMB)),
 }
+CC, CXX = ("arm-none-eabi-gcc",), ("arm-none-eabi-g++",)
+LINKED = ARM / "start.c", "-T", ARM / "memory.ld", "-nostartfiles", "--specs=rdimon.specs", "-lm"
 TICKS = 1.6  # of the timer's 25 MHz per instruction
 COUNTED = """
 #define main compared
@@ -119,6 +123,7 @@ def linear() -> Problem:
 
 
 DOUBLE, SINGLE = BOARDS
+PENALTIES = 1.0, 10.0  # TinyMPC's own, and one that its examples of quadrotors use
 PROBLEMS: dict[str, tuple[Callable[[], Problem], torch.dtype]] = {
     "car, 20 stages, two discs": (car, DOUBLE),
     "quadrotor of 12 states, 20 stages": (quadrotor, DOUBLE),
@@ -142,23 +147,32 @@ def said(*words: str | Path, folder: Path) -> str:
     return done.stdout
 
 
-def text_of(level: str, folder: Path, dtype: torch.dtype) -> int:
+def text_of(level: str, folder: Path, dtype: torch.dtype, sources: Sequence[str | Path] = ("car.c",)) -> int:
     """Bytes of code and tables."""
-    said("arm-none-eabi-gcc", *BOARDS[dtype][1], level, "-c", "car.c", "-o", "car.o", folder=folder)
-    return int(said("arm-none-eabi-size", "car.o", folder=folder).splitlines()[1].split()[0])
+    total = 0
+    for source in sources:
+        compiler = CXX if str(source).endswith("cpp") else CC
+        said(*compiler, *BOARDS[dtype][1], level, "-c", source, "-o", "part.o", folder=folder)
+        total += int(said("arm-none-eabi-size", "part.o", folder=folder).splitlines()[1].split()[0])
+    return total
+
+
+def emulated(folder: Path, dtype: torch.dtype) -> str:
+    """What the program `run` prints on the board."""
+    emulator = "qemu-system-arm", "-M", BOARDS[dtype][0], "-nographic", "-icount", "shift=6"
+    return said(*emulator, "-semihosting-config", "enable=on,target=native", "-kernel", "run", folder=folder)
 
 
 def counted(level: str, folder: Path, dtype: torch.dtype) -> np.ndarray:
     """Of periods status, whether controls are Python's, iterations, instructions and bytes of stack, (periods, 5)."""
-    board, flags = BOARDS[dtype]
     (folder / "counted.c").write_text(COUNTED if dtype == DOUBLE else single(COUNTED))
-    words = "car.c", "counted.c", ARM / "start.c", "-T", ARM / "memory.ld", "-nostartfiles", "--specs=rdimon.specs"
-    said("arm-none-eabi-gcc", *flags, level, f"-I{ARM}", *words, "-lm", "-o", "run", folder=folder)
-    emulator = "qemu-system-arm", "-M", board, "-nographic", "-icount", "shift=6"
-    host = "-semihosting-config", "enable=on,target=native"
-    rows = np.array(
-        [line.split() for line in said(*emulator, *host, "-kernel", "run", folder=folder).splitlines()], float
-    )
+    said(*CC, *BOARDS[dtype][1], level, f"-I{ARM}", "car.c", "counted.c", *LINKED, "-o", "run", folder=folder)
+    return periods_of(emulated(folder, dtype))
+
+
+def periods_of(printed: str) -> np.ndarray:
+    """Rows of what a program prints for each period, with instructions in place of ticks."""
+    rows = np.array([line.split() for line in printed.splitlines()], float)
     rows[:, 3] /= TICKS
     return rows
 
@@ -191,9 +205,88 @@ def table(problems: list[str]) -> str:
     return markdown(head, (row_of(name) for name in names))
 
 
+def sqp_row(name: str) -> list[str]:
+    """CasADi's SQP with one kind of Hessian on the car."""
+    with tempfile.TemporaryDirectory() as room:
+        folder = Path(room)
+        ours = export_c(car(), folder / "ours", name="car", changes=["x_ref"])
+        periods = arrays((ours / "car_test.c").read_text())
+        memory = write_sqp(car(), folder, periods, HESSIANS[name])
+        sizes = [text_of(level, folder, DOUBLE, ["sqp.c"]) for level in ("-Os", "-O2")]
+        said(*CC, *BOARDS[DOUBLE][1], "-O2", f"-I{ARM}", "sqp.c", "peer.c", *LINKED, "-o", "run", folder=folder)
+        rows = periods_of(emulated(folder, DOUBLE))
+    return [
+        f"car, CasADi's SQP, {name}", f"{memory / 1000:.0f}", *(f"{size / 1000:.0f}" for size in sizes),
+        f"{int(rows[:, 1].sum())} of {len(rows)}", f"{rows[0, 3] / 1e6:.1f}",
+        f"{rows[1:, 3].mean() / 1e6:.2f}", f"{rows[1:, 3].max() / 1e6:.1f}",
+    ]  # fmt: skip
+
+
+def tiny_rows(penalty: float) -> list[list[str]]:
+    """TinyMPC on the linear quadrotor: a row for each number of iterations."""
+    with tempfile.TemporaryDirectory() as room:
+        folder = Path(room)
+        *sources, room_of = write_tiny(linear(), folder, penalty)
+        how = (
+            *(f"-I{room_of / name}" for name in (".", "include", "include/Eigen")),
+            f"-I{ARM}",
+            "-DEIGEN_NO_DEBUG",
+            "-fno-exceptions",
+            "-fno-rtti",
+            "-std=gnu++17",
+            "-w",
+        )
+        flags = [flag for flag in BOARDS[DOUBLE][1] if not flag.startswith("-std")]
+        objects = []
+        for source in [*sources, folder / "peer.cpp"]:
+            objects.append(f"{source.stem}.o")
+            said(*CXX, *flags, "-O2", *how, "-c", source, "-o", objects[-1], folder=folder)
+        said(*CC, *flags, "-O2", "-c", ARM / "start.c", "-o", "start.o", folder=folder)
+        said(*CXX, *flags, "start.o", *objects, *LINKED[1:], "-o", "run", folder=folder)
+        text = sum(
+            int(said("arm-none-eabi-size", part, folder=folder).splitlines()[1].split()[0]) for part in objects[:-1]
+        )
+        lines = [line.split()[1:] for line in emulated(folder, DOUBLE).splitlines() if line.startswith("TINY")]
+    return [
+        [
+            f"{penalty:g}",
+            iterations,
+            f"{int(ticks) / TICKS / 1e6:.2f}",
+            off,
+            f"{int(heap) / 1000:.0f}",
+            f"{text / 1000:.0f}",
+        ]
+        for iterations, ticks, off, heap in lines
+    ]
+
+
+def others(peers: list[str]) -> str:
+    """Peers on the same emulated processor, in double precision."""
+    head = (
+        "controller", "memory, kB", "code -Os, kB", "code -O2, kB", "our controls", "first step, 1e6 instructions",
+        "a warm step, mean", "the longest",
+    )  # fmt: skip
+    tiny = (
+        "TinyMPC: penalty", "iterations", "1e6 instructions", "controls outside the bounds, share of their range",
+        "heap, kB", "code -O2, kB",
+    )  # fmt: skip
+    tables = []
+    if "CasADi" in peers:
+        tables.append(markdown(head, (sqp_row(name) for name in HESSIANS)))
+    if "TinyMPC" in peers:
+        tables.append(markdown(tiny, (row for penalty in PENALTIES for row in tiny_rows(penalty))))
+    return "\n\n".join(tables)
+
+
+def text(problems: list[str], peers: list[str]) -> str:
+    """Our controllers, and others."""
+    return f"{table(problems)}\n\n{others(peers)}".strip()
+
+
 main = Command(
-    __doc__, "export", table, "problems: {problems}; arm-none-eabi-gcc 12.2, QEMU 7.2",
+    __doc__, "export", text, "problems: {problems}; arm-none-eabi-gcc 12.2, QEMU 7.2", "CasADi",
     problems=(["car", "12 states", "linear"], "words in the names of problems; 30 spheres: half an hour"),
+    peers=(["CasADi", "TinyMPC"], "others on the same processor", ["CasADi", "TinyMPC"]),
 )  # fmt: skip
 
 
