@@ -232,8 +232,8 @@ class Integral(Constraint):
         return tuple(name for name in LIMITS if getattr(self, name) is not None)
 
     @property
-    def _summed(self) -> _Summed:
-        return _Summed(self.function, self.values, self.running, self.name)
+    def _summed(self) -> Summed:
+        return Summed(self.function, self.values, self.running, self.name)
 
     def _limits(self) -> Values:
         return Values(self._given, tuple(getattr(self, name).unsqueeze(-1) for name in self._given))
@@ -260,7 +260,7 @@ class Integral(Constraint):
 
 
 @dataclass(frozen=True)
-class _Summed(Carrying):
+class Summed(Carrying):
     """A further state: the integral of a function over time up to a knot."""
 
     function: Callable[..., Tensor]

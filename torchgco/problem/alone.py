@@ -18,7 +18,7 @@ from torchgco.base.tree import Rows, is_users
 from torchgco.base.values import whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.between_knots import BetweenKnots
-from torchgco.constraints.link import Integral, _Summed
+from torchgco.constraints.link import Integral, Summed
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
 from torchgco.problem.border import ONE_KNOT, OWN_ROW, STEP_OF_STAGE, called
@@ -262,11 +262,11 @@ class _Rows(_Constraint):
 
 class _Integral(_Constraint, Integral):
     @property
-    def _summed(self) -> _Summed:
+    def _summed(self) -> Summed:
         return _made(super()._summed, _Sums)
 
 
-class _Sums(_Summed):
+class _Sums(Summed):
     def _rate(self, x: Tensor, u: Tensor, k: int | Tensor | None) -> Tensor:
         if x.shape[:-1] == (1,):
             return super()._rate(x, u, k)
