@@ -393,8 +393,9 @@ def _histories(
         look: dict[str, Any] = {} if state else {"drawstyle": "steps-post"}
         for component in components:
             for course in component.leg.courses:
-                t = course.t if state else course.t[:-1]
-                ax.plot(t, component.series(course), color=course.colour, linewidth=1.2, **look)
+                values = component.series(course)
+                held = values if state else np.append(values, values[-1:])  # the last one for a stage, too
+                ax.plot(course.t[: len(held)], held, color=course.colour, linewidth=1.2, **look)
         for leg in legs[1:]:
             for course in leg.courses:
                 colour = INK if len(leg.courses) == 1 else course.colour
