@@ -1,7 +1,10 @@
 """By the clock of solves, compiling takes no time: every library that is loaded takes an hour of the clocks here."""
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -79,6 +82,58 @@ def test_missions(loads: list[float]) -> None:
     assert len(loads) >= 2
     for name in ("planner_seconds", "tracker_seconds"):
         assert float(getattr(log, name).nan_to_num(0.0).max()) == 0.0
+
+
+FIRST_DERIVATIVES = """
+import sys
+from importlib.abc import MetaPathFinder
+import torch
+import torchgco
+from torchgco import ControlBounds, FreeTime, FunctionCost, FunctionDynamics, Goal, Problem, StateBounds
+from torchgco.base import clock
+
+class Slow(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        loads.append(name)
+
+cart = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), n=2, m=1, dt=0.1, integrator="rk4")
+limits = [ControlBounds(-1.0, 1.0), StateBounds([-9.0, -1.0], [9.0, 1.0])]
+cost, end = FunctionCost(lambda x, u: 0.0 * u[..., 0]), Goal(state=[0.0, 0.0], required=True)
+problem, loads = Problem(cart, cost, limits, [[2.0, 0.0]], 20, end, time=FreeTime(0.1, 5.0, 1.0)), []
+sys.meta_path.insert(0, Slow())
+clock._left, clock._now = clock._Left(), lambda: (3600.0 * len(loads),) * 2
+solution = torchgco.solve(problem, max_seconds=1800.0)
+print(solution.statuses[0].name, "torch._dynamo" in loads, clock.seconds(), clock.processor_seconds())
+"""
+
+
+@pytest.mark.slow
+def test_modules_that_a_first_solve_loads() -> None:
+    """PyTorch's first derivatives load some 800 modules: a limit isn't reached by that, in a process of its own."""
+    words = [sys.executable, "-W", "ignore", "-c", FIRST_DERIVATIVES]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[2])
+    assert done.stdout.split() == ["CONVERGED", "True", "0.0", "0.0"], done.stderr
+
+
+def test_blocks_that_load_modules(loads: list[float], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Blocks in each other are left out once, and blocks that load nothing count."""
+    (tmp_path / "loaded_by_a_test.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    @clock.loading()
+    def work(name: str) -> None:
+        loads.append(HOUR)
+        with clock.loading():
+            __import__(name)
+            loads.append(HOUR)
+        with clock.setting_up(), clock.loading():
+            loads.append(HOUR)
+
+    began = clock.seconds()
+    work("loaded_by_a_test")
+    assert clock.seconds() == began
+    work("loaded_by_a_test")
+    assert clock.seconds() == began + 2 * HOUR == clock.processor_seconds()
 
 
 def test_every_thread_has_its_own(loads: list[float]) -> None:

@@ -10,6 +10,7 @@ from scipy.optimize import lsq_linear
 from tests.problems import planar_batch, quadrotor_batch
 from torchgco import (
     ControlBounds,
+    FreeTime,
     FunctionConstraint,
     FunctionDynamics,
     InputError,
@@ -95,6 +96,34 @@ def test_an_arc_that_bulges_into_a_sphere_is_caught() -> None:
     assert clearance <= 0.01 - 0.02  # the clearance of the true arc
     straight = circling(0.02, "none")[0]  # a step without a field is judged by its chord
     assert float(certify(straight, X, U).clearance) == pytest.approx(chord - 0.02)
+
+
+@pytest.mark.parametrize("integrator", ["euler", "midpoint", "rk4"])
+@pytest.mark.parametrize("free", [False, True])
+def test_the_clearance_is_that_of_the_path(integrator: str, free: bool) -> None:
+    """Of stages of half a second and accelerations up to 8 m/s^2, whose paths leave their chords by up to 0.25 m."""
+    step, N, B, random = 0.5, 6, 16, torch.Generator().manual_seed(5)
+    draw = lambda *shape: 2.0 * torch.rand(*shape, generator=random, dtype=torch.float64) - 1.0
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 2:], u), -1), 4, 2, step, integrator, slice(0, 2))
+    centers, velocities, factors = 3.0 * draw(B, 3, 2), draw(B, 3, 2), 1.0 + 0.5 * draw(B, 1)
+    spheres = Spheres(centers, torch.full((B, 3), 0.2).double(), 0.1, velocities)
+    time = FreeTime(0.1, 3.0, 1.0) if free else None
+    problem = Problem(model, QuadraticCost([1] * 4, [1] * 2, [1] * 4), [spheres], 2.0 * draw(B, 4), N, time=time)
+    lengths, U, x = step * (factors if free else torch.ones_like(factors)), 8.0 * draw(B, N, 2), problem.x0
+    share, X, nearest = torch.linspace(0.0, 1.0, 1001, dtype=torch.float64).view(-1, 1, 1), [x], []
+    for k in range(N):
+        t = share * lengths
+        bent = 0.5 * t**2 * U[:, k] if integrator != "euler" else 0.0
+        p, spheres_at = x[:, :2] + t * x[:, 2:] + bent, centers + (k * lengths + t).unsqueeze(-1) * velocities
+        nearest.append((p.unsqueeze(2) - spheres_at).norm(dim=-1).amin((0, 2)) - 0.3)
+        x = torch.cat((p[-1], x[:, 2:] + lengths * U[:, k]), -1)
+        X.append(x)
+    times = lengths * torch.arange(N + 1) if free else None
+    found = certify(problem, torch.stack(X, dim=1), U, times=times)
+    true = torch.stack(nearest).amin(0)
+    assert float(found.dynamics_residual.max()) < 1e-12
+    # A path leaves the chords of 16 pieces of a stage by at most 1 / 256 of what it leaves its own.
+    assert bool(((found.clearance <= true + 1e-4) & (found.clearance >= true - 0.004)).all())
 
 
 @pytest.mark.slow

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,6 +19,14 @@ PERIOD = 0.05
 def course(speed: float) -> Course:
     ball = Ball(np.array([3.0, 1.5, 0.0]), 0.24, np.array([0.0, speed, 0.0]))
     return Course((ball,), np.array([6.0, 0.0, 0.0]), 0.5)
+
+
+def test_gates_lie_in_the_picture() -> None:
+    """Balls and frames, also beside the way that is flown."""
+    frame = np.array([[2.0, -4.0, 1.0], [2.0, -3.0, 1.0], [2.0, -3.0, 2.0], [2.0, -4.0, 2.0]])
+    whole = replace(course(0.0), gates=((np.array([[8.0, 0.0, 0.0]]), 0.4), (frame, 0.0)))
+    low, high = whole.limits(np.stack([np.linspace(0.0, 6.0, 9), np.zeros(9), np.zeros(9)], axis=-1))
+    assert (low <= [0.0, -4.0, -0.4]).all() and (high >= [8.4, 0.4, 2.0]).all()
 
 
 def flown(steps: int) -> tuple[pd.DataFrame, np.ndarray]:

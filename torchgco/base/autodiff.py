@@ -15,6 +15,7 @@ from torch import _is_functional_tensor as is_functional  # type: ignore[attr-de
 from torch._C._functorch import is_functorch_wrapped_tensor  # type: ignore[import]
 from torch.overrides import TorchFunctionMode
 
+from torchgco.base.clock import loading
 from torchgco.base.gradients import is_forward
 
 
@@ -63,6 +64,7 @@ class WithoutReading(TorchFunctionMode):
         self.read += tensors
 
 
+@loading()
 def slope_along(function: Callable[..., Tensor], args: tuple[Tensor, ...], tangents: tuple[Tensor, ...]) -> Tensor:
     """The derivative of function(*args) along tangents, of the shape of its value.
 
@@ -75,6 +77,7 @@ def slope_along(function: Callable[..., Tensor], args: tuple[Tensor, ...], tange
     return torch.func.vjp(backward, torch.zeros_like(value))[1](tangents)[0]
 
 
+@loading()
 def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
     """Derivatives of function(*args) (..., out) with respect to each argument's last axis: (..., out, in) each."""
     sizes = [arg.shape[-1] for arg in args]
@@ -87,6 +90,7 @@ def jacobian(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ..
     return torch.func.vmap(along)(basis).movedim(0, -1).split(sizes, dim=-1)
 
 
+@loading()
 def gradients(function: Callable[..., Tensor], *args: Tensor) -> tuple[Tensor, ...]:
     """Gradients of function(*args).sum() with respect to each argument; zero where the sum doesn't depend on it.
 
@@ -113,6 +117,7 @@ def gradients_at_once(function: Callable[..., Tensor], *args: Tensor) -> tuple[T
     return gradients(function, *args)
 
 
+@loading()
 def gradient_and_hessian(function: Callable[[Tensor], Tensor], z: Tensor) -> tuple[Tensor, Tensor]:
     """Gradient (..., s) and Hessian (..., s, s) of function(z) (...), which maps each row of z (..., s) to a number.
 

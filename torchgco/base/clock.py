@@ -1,7 +1,8 @@
-"""A clock of solves that stands still while code is traced and compiled: a first run takes no longer than others."""
+"""A clock of solves that stands still while code is traced, compiled or loaded: first runs take no longer."""
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -30,6 +31,21 @@ def setting_up() -> Iterator[None]:
     finally:
         wall, processor = (now - before for now, before in zip(_now(), began, strict=True))
         _left.out, _left.since = (_left.out[0] + wall, _left.out[1] + processor), None
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Where this block loads modules, as PyTorch's derivatives do the first time, for seconds, clocks leave it out."""
+    if _left.since is not None:
+        yield
+        return
+    known, wall, processor = len(sys.modules), seconds(), processor_seconds()
+    try:
+        yield
+    finally:
+        if len(sys.modules) > known:
+            more = seconds() - wall, processor_seconds() - processor
+            _left.out = _left.out[0] + more[0], _left.out[1] + more[1]
 
 
 def seconds() -> float:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import hessian_forward, jacobian, not_finite
+from torchgco.base.clock import loading
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import MISTAKES
 from torchgco.base.tree import is_users
@@ -72,6 +73,7 @@ def _rows(values: Tensor, z: Tensor) -> Tensor:
     return torch.cat(parts).movedim(0, -2)
 
 
+@loading()
 def by_forward(function: Function, w: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """The same by forward over reverse differentiation, which also works in inference mode; many times slower."""
 
@@ -193,6 +195,7 @@ def joined(X: Tensor, U: Tensor) -> Tensor:
     return torch.cat((X, torch.nn.functional.pad(U, (0, 0, 0, 1))), dim=-1)
 
 
+@loading()
 def joins_knots(part: Constraint, problem: Problem) -> bool:
     """Whether rows of a constraint of one problem change with another knot than their own.
 

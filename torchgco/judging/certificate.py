@@ -28,7 +28,7 @@ from torchgco.problem.alone import row_by_row
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
-from torchgco.problem.times import bends
+from torchgco.problem.times import Paths, bends, paths
 
 HARDLY_SEEN = 1e-6  # share of the cost that a control is held to change over its range at least
 LITTLE = 1e-3  # share of a control's size: by as much as its slopes change over that, they count at least
@@ -150,30 +150,32 @@ def _bound_violation(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
 
 def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    nearest = X.new_full((), torch.inf)
-    stages = int(problem.stages[0])  # the chords after them are points
+    nearest, path = X.new_full((), torch.inf), paths(problem, X, U)[0]
+    stages = path.pieces * int(problem.stages[0])  # the chords after them are points
+    k = torch.arange(problem.N, device=X.device).repeat_interleave(path.pieces)
     for distance in (constraint.bare for constraint in problem.constraints):
         if isinstance(distance, Distance):
-            chords = distance.measured(X)[1][0]
-            bulge = _bulge(distance, problem, X, U)  # (N|1, P|1)
+            distance = distance if path.pieces == 1 else distance.in_pieces(path.pieces)
+            chords = distance.measured(path.X)[1][0]
+            bulge = _bulge(distance, problem, path, U[:, k], k)  # (N|1, P|1)
             gaps = chords.unflatten(-1, (bulge.shape[-1], -1)) - bulge.unsqueeze(-1)
             nearest = torch.minimum(nearest, least(gaps[:stages].flatten(1).unsqueeze(0))[0])
     return nearest
 
 
-def _bulge(distance: Distance, problem: Problem, X: Tensor, U: Tensor) -> Tensor:
-    """How far a part's places may leave their chord of each interval, (N|1, P|1), m: along a known field, else where
-    the states change evenly."""
-    dynamics = problem.along
+def _bulge(distance: Distance, problem: Problem, path: Paths, U: Tensor, k: Tensor) -> Tensor:
+    """How far a part's places may leave their chord of each piece, of stages k by controls U, (N|1, P|1), m: along a
+    known field, else where the states change evenly."""
     if not bends(problem):
-        return distance.even_bulge(X)[0]
+        return distance.even_bulge(path.X)[0]
+    dynamics, X, dt = problem.dynamics.at(k), path.X, problem.dynamics.dt / path.pieces
     field = lambda x: dynamics.field(x, U)
     velocity = lambda x: slope_along(distance.places, (x,), (field(x),))
-    half = X[:, :-1] + 0.5 * dynamics.dt * field(X[:, :-1])
+    half = X[:, :-1] + 0.5 * dt * field(X[:, :-1])
     samples = [slope_along(velocity, (x,), (field(x),))[0] for x in (X[:, :-1], half, X[:, 1:])]
     a = torch.stack(samples)  # (3, N, P, d)
     change = a.diff(dim=0).norm(dim=-1).amax(0)
-    return dynamics.dt**2 / 8.0 * (a.norm(dim=-1).amax(0) + change)
+    return dt**2 / 8.0 * (a.norm(dim=-1).amax(0) + change)
 
 
 def _fitted_kkt(problem: Problem, X: Tensor, U: Tensor) -> Tensor:

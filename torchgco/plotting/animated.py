@@ -144,16 +144,16 @@ def _moving(ax: Axes, world: World, plane: Plane, t: float) -> list[Artist]:
 
 def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float, is_there: bool) -> list[Artist]:
     """A trajectory up to t, s, and the vehicle, where it is there: its body, or a ball of its radius."""
-    past, drawn = course.t <= t, list[Artist]()
-    for path in course.paths:
-        now = np.array([np.interp(t, course.t, path[:, i]) for i in plane])
+    past, drawn = course.way.t <= t, list[Artist]()
+    for path in course.way.paths:
+        now = np.array([np.interp(t, course.way.t, path[:, i]) for i in plane])
         way = np.concatenate((path[past][:, plane], now[None]))
         drawn += ax.plot(*way.T, color=course.colour, linewidth=1.4, zorder=7)
         if world.body is None and is_there:
             radius = world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
             drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
     if world.body is not None and is_there:
-        state = np.array([[np.interp(t, course.t, component) for component in course.X.T]])
+        state = np.array([[np.interp(t, course.way.t, component) for component in course.way.X.T]])
         if not np.isfinite(state).all():
             return drawn
         look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}

@@ -108,9 +108,10 @@ class Course:
         return Scene(*fields, period, np.zeros(1), self.map, body=self.body)
 
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner (3,) of a box around goal and track, a little wider where obstacles are."""
+        """Lower and upper corner (3,) of a box around goal, gates and track, a little wider where obstacles are."""
         reach = self.vehicle_radius if self.body is None else self.body.reach
         ways = [track[:, :3] + side * reach for side in (-1.0, 1.0)]
+        ways += [corners + side * radius for corners, radius in self.gates for side in (-1.0, 1.0)]
         low, high = view(self._scene(track[:1]), [0], ways, [])
         return low, high
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -20,6 +21,7 @@ from torchgco.plotting.bodies import ABOVE, SIDE
 from torchgco.plotting.problems import TALLEST_SCENE, WIDTH, Course, SceneMap
 from torchgco.plotting.style import INK, PALETTE, SMALL, NotebookFigure, tidy
 from torchgco.plotting.trajectory import LIMIT
+from torchgco.plotting.ways import ways_along
 from torchgco.problem.problem import Problem
 
 LOWER = 1.6  # inches, the height of the distances over time
@@ -77,8 +79,11 @@ def _scene(members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.n
     t = float(members[0].dynamics.dt) * np.arange(members[0].N + 1)
     courses = []
     for v, (member, x, u) in enumerate(zip(members, X, U, strict=True)):
-        way = x[b][:, member.position]
-        courses.append(Course(b, x[b], u[b], t, (way,), _colour(v, len(members)), f"vehicle {v}", True, True))
+        place, colour, label = member.position, _colour(v, len(members)), f"vehicle {v}"
+        columns, like = list(range(place.start, place.stop)), member.x0
+        X_b, U_b = (torch.as_tensor(array[b : b + 1]).to(like) for array in (x, u))
+        (way,) = ways_along(member.take(torch.tensor([b], device=like.device)), X_b, U_b, None, [columns])
+        courses.append(Course(b, x[b], u[b], t, (x[b][:, place],), colour, label, True, True, way.until(t)))
     planes = (ABOVE, SIDE) if courses[0].paths[0].shape[1] == 3 else (ABOVE,)
     return SceneMap.of(members[0], courses, planes)
 

@@ -38,6 +38,7 @@ from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import World, flown, leaving, passes, view, world_of
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
+from torchgco.plotting.ways import Way, ways_along
 from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
@@ -64,6 +65,7 @@ class Course:
     label: str
     keeps: bool  # whether its constraints hold
     touches: bool  # whether contact is looked for
+    way: Way  # between the knots, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,11 @@ class Leg:
 
     def after(self, begins: np.ndarray, labels: Sequence[str]) -> Leg:
         """The same, of problems that begin at times (B,), with other labels (B,)."""
-        moved = [replace(course, t=course.t + begins[course.b], label=labels[course.b]) for course in self.courses]
+        moved = []
+        for course in self.courses:
+            begin, label = begins[course.b], labels[course.b]
+            way = replace(course.way, t=course.way.t + begin)
+            moved.append(replace(course, t=course.t + begin, label=label, way=way))
         return replace(self, courses=moved)
 
     @property
@@ -184,7 +190,9 @@ def courses_of(problem: Problem, solution: Solution, b: int | Sequence[int] | No
         t, unit = times(problem) if solution.times is None else solution.times, "t [s]"
     except InputError:
         t, unit = torch.arange(problem.N + 1, device=problem.x0.device), "knot"
-    shown, touching = [], _touching(problem.take(torch.tensor(places, device=problem.x0.device)), solution.take(places))
+    some, found = problem.take(torch.tensor(places, device=problem.x0.device)), solution.take(places)
+    shown, touching = [], _touching(some, found)
+    ways = ways_along(some, found.X, found.U, found.times, _positions(problem))
     for i, b in enumerate(places):
         last = int(problem.stages[b])
         X, U = (array[b].detach().cpu().double().numpy() for array in (solution.X, solution.U))
@@ -193,7 +201,8 @@ def courses_of(problem: Problem, solution: Solution, b: int | Sequence[int] | No
         X, U, moments = X[: last + 1], U[:last], moments[: last + 1]
         paths = tuple(X[:, columns] for columns in _positions(problem))
         keeps = bool(solution.violation[b] <= ADMITTED)
-        shown.append(Course(b, X, U, moments, paths, PALETTE[i % len(PALETTE)], label, keeps, touching[i]))
+        way = ways[i].until(moments)
+        shown.append(Course(b, X, U, moments, paths, PALETTE[i % len(PALETTE)], label, keeps, touching[i], way))
     return shown, unit
 
 
@@ -310,20 +319,24 @@ class SceneMap:
     def _course(self, ax: Axes, plane: Plane, course: Course) -> set[str]:
         """Draw a trajectory, where it touches something, and where it leaves the picture."""
         drawn = set[str]()
-        look: dict[str, Any] = {"color": course.colour, "linewidth": 1.2, "marker": ".", "markersize": 3}
-        for path in course.paths:
-            shown = flown(path)[:, plane]
-            ax.plot(*shown.T, zorder=3, **look)
+        look: dict[str, Any] = {"color": course.colour, "zorder": 3}
+        for path, way in zip(course.paths, course.way.paths, strict=True):
+            shown = flown(way)[:, plane]
+            knots: dict[str, Any] = {"marker": ".", "markersize": 3, "linewidth": 1.2}
+            if course.way.pieces > 1:
+                ax.plot(*shown.T, linewidth=1.2, **look)
+                knots["linewidth"] = 0.0
+            ax.plot(*flown(path)[:, plane].T, **knots, **look)
             if (away := leaving(self.box[:, plane], shown)) is not None:
                 ax.plot(*away[0][:, None], color=course.colour, zorder=6, clip_on=False, **marker("away", away[1]))
                 drawn.add("away")
-        states = course.X[: len(flown(course.paths[0]))]
         if self.world.body is not None:
-            self.world.body.draw(ax, states, plane, course.colour)
+            self.world.body.draw(ax, course.X[: len(flown(course.paths[0]))], plane, course.colour)
             drawn.add("body")
         if not course.touches:
             return drawn
-        touched = contacts(self.world.obstacles, flown(course.paths[0]), self.world.first.dt, states)
+        way = flown(course.way.paths[0])
+        touched = contacts(self.world.obstacles, way, self.world.first.dt / course.way.pieces, course.way.X[: len(way)])
         if len(touched):
             ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))
             drawn.add("contact")
@@ -380,8 +393,9 @@ def _histories(
         look: dict[str, Any] = {} if state else {"drawstyle": "steps-post"}
         for component in components:
             for course in component.leg.courses:
-                t = course.t if state else course.t[:-1]
-                ax.plot(t, component.series(course), color=course.colour, linewidth=1.2, **look)
+                values = component.series(course)
+                held = values if state else np.append(values, values[-1:])  # the last one for a stage, too
+                ax.plot(course.t[: len(held)], held, color=course.colour, linewidth=1.2, **look)
         for leg in legs[1:]:
             for course in leg.courses:
                 colour = INK if len(leg.courses) == 1 else course.colour

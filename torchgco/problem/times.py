@@ -15,6 +15,7 @@ from torchgco.base.values import Values
 from torchgco.dynamics.base import INTEGRATORS, Dynamics, FunctionDynamics
 from torchgco.dynamics.names import Quantity, controls_of, states_of
 from torchgco.obstacles.base import ADMITTED
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
 
 LENGTHS = "dt"  # the knot values of this name are the lengths of stages, s
@@ -135,6 +136,21 @@ def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> 
         )
         polylines.append(Paths(rows, count, torch.cat((fine, X[rows, -1:]), dim=1)))
     return polylines
+
+
+def curves(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = None) -> list[Paths]:
+    """`paths` of which positions, too, whether anything measures them or not, leave their chords by at most 1e-3 m.
+
+    Args:
+        times: of the knots (B, N+1), s, where the time is free.
+    """
+    whole, X, U = at_times(problem, X, U, times)
+    off = None
+    if bends(whole) and whole.dynamics.position is not None and len(X) > 0:
+        apart = states_within(whole, X, U, 2)[:, :, 0] - 0.5 * (X[:, :-1] + X[:, 1:])
+        off = apart[..., whole.dynamics.position].norm(dim=-1).amax(-1)
+        off = torch.maximum(off, bulge(whole, X, U))
+    return [part._replace(X=part.X[..., : problem.n]) for part in paths(whole, X, U, off)]
 
 
 def states_within(problem: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:
