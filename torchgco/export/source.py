@@ -187,7 +187,7 @@ def _structures(K: int) -> int:
 def _solve_numbers(problem: Problem) -> int:
     """How many numbers the arrays of the structure Solve have, but for those that are made."""
     N, n, m = problem.N, problem.n, problem.m
-    stage = (n + m) * (n + m) + (n + m) * n + m * n
+    stage = (n + m) * (n + m) + (n + m) * n + n * n
     return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1)
 
 

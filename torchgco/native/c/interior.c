@@ -195,7 +195,7 @@ TGCO_LARGE void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal,
         lowered |= low;
     }
     if (!any(lowered)) return;
-    V cost = values(t, lowered, t->lanes.X, t->lanes.U, t->cn, t->gapn);
+    V cost = cost_along(t, lowered, t->lanes.X, t->lanes.U);
     k->phi = tgco_choose(lowered, cost - t->mu * logarithms(t, t->s), k->phi);
     for (int l = 0; l < LANES; l++) if (LANE(lowered, l)) k->pairs[l] = 0;
 }
@@ -274,7 +274,7 @@ TGCO_LARGE I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
     if (t->how->smoothing > 0) return of & NOT(of); /* it is to stay */
     if (!any(of)) return of;
-    V cost = values(t, of, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
+    V cost = cost_along(t, of, t->lanes.X, t->lanes.U), size;
     EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
     EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
@@ -326,7 +326,7 @@ TGCO_LARGE I readmit(Barrier *t, Track *k, I of, double admitted) {
     EACH_ROW(t, 0, q) t->dz[q] = tgco_truth(t->out[q]); /* no step is under way */
     visit_rows(t, broken, 0, CALLED(come_in));
     EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
-    if (!any(changed)) return changed;
+    if (!any(changed)) { expand(t); return changed; } /* rows were visited in the model's memory */
     for (int l = 0; l < LANES; l++) if (LANE(changed, l)) {
         LANE(t->mu, l) = first_barrier(t, l);
         LANE(k->watching, l) = k->shortened[l] = 0;
@@ -345,7 +345,6 @@ TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error)
     if (t->some_out) readmit(t, k, running, how->theta_max_fact); /* beyond which no residual is accepted */
     relax(t, k, running);
     residuals(t, t->c, t->s, t->r);
-    memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     expand(t);
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(how->smoothing) * t->scale) * scale_z);
@@ -370,6 +369,7 @@ TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error)
     running &= NOT(ended) & NOT(astray);
     if (!any(running)) return ended;
     lower_barrier(t, k, running, dual, primal, scale_z);
+    memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     I moving = factor_shifted(t, k, running, running);
     solve(t);
     solve_rows(t);

@@ -53,7 +53,7 @@ static void vary_controls(const Barrier *t, int64_t k, OUT du) {
    within rounding of its terms is none. */
 TGCO_LARGE void find_moved(const Barrier *t, int64_t i, int64_t k, IN x, IN u, const V *z) {
     int rows = t->lanes.of->constraint[i].rows;
-    Truths moves = t->moves + row_of(t, i, k);
+    Numbers moves = t->moves + row_of(t, i, k);
     OUT change = t->across[0]; OUT part = t->across[1]; OUT terms = t->across[2]; V own[S];
     along(t, i, k, x, u, z, change);
     for (int j = 0; j < rows; j++) terms[j] = SET(0.0);
@@ -62,8 +62,8 @@ TGCO_LARGE void find_moved(const Barrier *t, int64_t i, int64_t k, IN x, IN u, c
         along(t, i, k, x, u, own, part);
         for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
     }
-    V rounding = SET(ROUNDINGS * t->how->last_bit);
-    for (int j = 0; j < rows; j++) moves[j] |= NOT(tgco_fabs(change[j]) <= rounding * terms[j]);
+    V rounding = SET(ROUNDINGS * t->how->last_bit), one = SET(1.0);
+    for (int j = 0; j < rows; j++) moves[j] = tgco_choose(tgco_fabs(change[j]) <= rounding * terms[j], moves[j], one);
 }
 
 /* Rows j of constraint i at knot k, in the lanes `of`, with less room than a slack is given at first, or than a guess is
@@ -127,7 +127,7 @@ TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
     int some = 0;
     for (int64_t k = 0; k <= p->N; k++) for (int64_t i = 0; i < p->constraints; i++) some |= is_visited(t, of, all, i, k);
     if (!some) return;
-    memset(t->moves, 0, t->rows * sizeof(I));
+    memset(t->moves, 0, t->rows * sizeof(V));
     find_nearby(t);
     for (int near = 1; near >= 0; near--) {
         IN X = near ? s->Xn : s->X; IN U = near ? s->Un : s->U;
@@ -157,12 +157,12 @@ TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
 static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    Truths moves = t->moves + q;
+    Numbers moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I tight = is_tight(t, of, i, k, j), is_state = of & NOT(of);
         if (is_kind(con, BOUNDS) && con->variable[j] < NX) is_state = NOT(is_state);
-        t->out[q + j] |= tight & NOT(moves[j]);
-        t->fixes[q + j] &= NOT(of) | moves[j] | NOT(is_state); /* controls that are fixed weren't varied */
+        t->out[q + j] |= tight & NOT(tgco_is(moves[j]));
+        t->fixes[q + j] &= NOT(of) | tgco_is(moves[j]) | NOT(is_state); /* controls that are fixed weren't varied */
     }
 }
 
@@ -176,9 +176,9 @@ static inline I is_broken(const Barrier *t, int64_t q) {
 static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    Truths moves = t->moves + q;
+    Numbers moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
-        I in = of & is_broken(t, q + j) & moves[j];
+        I in = of & is_broken(t, q + j) & tgco_is(moves[j]);
         t->out[q + j] &= NOT(in);
         t->s[q + j] = tgco_choose(in, SET(t->how->bound_push), t->s[q + j]);
     }
@@ -292,9 +292,9 @@ static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, IN active) {
 TGCO_LARGE void soften_rows(Barrier *t, I of, V share, IN active) {
     const Problem *p = t->lanes.of;
     int some = active ? 1 : 0;
-    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
-    for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
+    if (next_of(t, 1, 0) < p->constraints) some = 1;
     if (!some) return;
+    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
     LOCAL_NUMBERS(t, squares, S * S, S * NX);
     V moves[S], zero = SET(0.0), one = SET(1.0);
     measure_costs(t);
