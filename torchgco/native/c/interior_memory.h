@@ -26,6 +26,11 @@ static inline int64_t next_of(const Barrier *t, int equality, int64_t i) {
     return i;
 }
 
+static const double *multipliers_of(const Problem *p) {
+    for (int64_t i = 0; i < p->constraints; i++) if (p->constraint[i].lam) return p->constraint[i].lam;
+    return NULL;
+}
+
 /* The model of an iterate and the step that it leads to take turns with the same memory: H and g[0] have been read when there
    is a step, and all of the model before a trial is made; what needs the model again calls `expand`. */
 static void lay_out_turns(Barrier *t, Cut *m) {
@@ -51,7 +56,8 @@ static int64_t shape(Barrier *t, Numbers memory) {
     t->cost_slope = cut(&m, (N + 1) * S);
     t->P = cut(&m, (N + 1) * TRIANGLE(NX)); t->L = cut(&m, N * TRIANGLE(NU));
     if (t->how->free_start) { t->is_free = cut(&m, NX); t->L_start = cut(&m, TRIANGLE(NX)); }
-    t->c = cut(&m, rows); t->s = cut(&m, rows); t->z = cut(&m, rows); t->r = cut(&m, rows);
+    t->c = cut(&m, rows); t->s = cut(&m, rows); t->r = cut(&m, rows);
+    t->z = cut_at(&m, p, multipliers_of(p), rows);
     for (int i = 0; i < 3; i++) t->across[i] = cut(&m, t->widest);
     t->room = cut(&m, rows); t->relaxed = cut(&m, rows);
     if (next_of(t, 1, 0) < p->constraints) t->gives = cut(&m, rows);
