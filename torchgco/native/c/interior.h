@@ -4,6 +4,10 @@
 #include "stack.h" /* or export/c/stack.h */
 #include "triangle.h"
 
+/* Of a row, see interior_fixed.h: outside the barrier all but the first. FIXED holds as an equality, BESIDE coincides with
+   what does, or is to. */
+enum { INSIDE, LEFT_OUT, BESIDE, FIXED };
+
 typedef struct {
     Lanes lanes;
     const Interior *how;
@@ -15,10 +19,10 @@ typedef struct {
     Numbers is_free, L_start;    /* (NX): 1 where the start is free; (NX, NX): its factor. None where none is free */
     Numbers dx, du;              /* (N+1, NX), (N, NU) */
     Numbers c, cn, s, sn, z, r, ds, dz;   /* (rows): values, slacks, multipliers, residuals, and of trial and step */
-    Numbers room, relaxed; /* (rows): half the range between two bounds, 1 at most; by how much a row is relaxed */
-    int some_relaxed;  /* whether any is, in a lane */
-    Truths out, fixes; /* (rows): rows of inequalities outside the barrier, and those of them that hold as equalities */
-    int some_out;   /* whether there are any in a lane; see interior_fixed.h */
+    Numbers room; /* (rows): half the range between two bounds, 1 at most; in lanes that are `relaxed` by how much a row is */
+    I relaxed;    /* lanes whose rows are */
+    Numbers role; /* (rows): a Role */
+    int some_out; /* whether a row of inequalities is outside the barrier in a lane */
     double admitted; /* violation of rows outside, up to which they stay there */
     int64_t *first, rows;        /* the first row of each constraint, and how many there are, also at its end */
     Numbers across[3]; /* (widest): numbers of the rows of one constraint at one knot */

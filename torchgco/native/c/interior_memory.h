@@ -14,7 +14,7 @@ typedef struct {
     V left;        /* the smallest complementarity so far, of those that counted */
     Pair filter[LANES][PAIRS];
     int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
-    I restoring, crawls, relaxed; /* relaxed: the rows are */
+    I restoring, crawls;
     I presses; /* mu falls further than the tolerance asks for: see barrier_counts */
     I watching; /* a step was taken on trial; theta, phi, slope and alpha are those before it */
 } Track;
@@ -59,10 +59,9 @@ static int64_t shape(Barrier *t, Numbers memory) {
     t->c = cut(&m, rows); t->s = cut(&m, rows); t->r = cut(&m, rows);
     t->z = cut_at(&m, p, multipliers_of(p), rows);
     for (int i = 0; i < 3; i++) t->across[i] = cut(&m, t->widest);
-    t->room = cut(&m, rows); t->relaxed = cut(&m, rows);
+    t->room = cut(&m, rows); t->role = cut(&m, rows);
     if (next_of(t, 1, 0) < p->constraints) t->gives = cut(&m, rows);
-    t->out = (Truths)cut(&m, rows); t->fixes = (Truths)cut(&m, rows);
-    t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
+    t->kept = cut(&m, 2 * (N + 1) * NX + N * NU + 2 * rows);
     lay_out_turns(t, &m);
     return m.used;
 }

@@ -45,9 +45,12 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, IN x, IN u, OUT
     } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
 }
 
+static inline I is_out(const Barrier *t, int64_t q) { return t->role[q] != SET(INSIDE); }
+static inline I is_fixed(const Barrier *t, int64_t q) { return t->role[q] == SET(FIXED); }
+
 /* `inside` of rows in the barrier, `fixed` of bounds that coincide, and nothing of rows that no variable moves. */
 static inline V by_role(const Barrier *t, int64_t q, V inside, V fixed) {
-    return t->some_out ? tgco_choose(t->out[q], tgco_if(t->fixes[q], fixed), inside) : inside;
+    return t->some_out ? tgco_choose(is_out(t, q), tgco_if(is_fixed(t, q), fixed), inside) : inside;
 }
 
 /* The dual regularisation of a row that holds as an equality. */

@@ -18,13 +18,14 @@ TGCO_LARGE V values(const Barrier *t, I of, IN X, IN U, OUT c, OUT gap) {
     const Lanes *s = &t->lanes;
     V cost = cost_along(t, of, X, U);
     const Problem *p = s->of;
+    int relaxes = any(t->relaxed);
     for (int64_t k = 0; k <= p->N; k++) {
         IN x = X + k * NX; IN u = k < p->N ? U + k * NU : 0;
         for (int64_t i = 0; i < p->constraints; i++) {
             if (p->constraint[i].place[k] == NOWHERE) continue;
             int64_t q = row_of(t, i, k), end = q + p->constraint[i].rows;
             rows_at(s, i, k, x, u, c + q);
-            if (t->some_relaxed) for (; q < end; q++) c[q] -= t->relaxed[q];
+            if (relaxes && !p->constraint[i].equality) for (; q < end; q++) c[q] -= tgco_if(t->relaxed, t->room[q]);
         }
         if (!u) break;
         V next[NX];
