@@ -142,7 +142,7 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
     count = _count(kept)
     made_numbers = sum(kept_by(how)[address].numel() for address in changing.copied)
     numbers = count + 2 * FILTERED + _solve_numbers(problem) + made_numbers
-    room = _structures(K) + -(-numbers * number // 8)
+    room = structure_numbers(K) + -(-numbers * number // 8)
     texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
@@ -178,7 +178,7 @@ def _count(kept: Kept) -> int:
     return int(function(ctypes.byref(kept.how.copy({"of": alone}))))
 
 
-def _structures(K: int) -> int:
+def structure_numbers(K: int) -> int:
     """The size of all structures of a step without arrays of numbers, in doubles, at most."""
     size = lambda kind: -(-ctypes.sizeof(kind) // 8)
     own = size(c.Interior) + 2 * size(c.Problem) + max(1, K) * size(c.Constraint)
@@ -345,7 +345,7 @@ def _structure(K: int, made: list[str]) -> str:
             "    double mu, error, theta, falls, cost;",
             "    int64_t iterations;",
             "    int32_t status;",
-            "    double *X, *U, *beside; /* (N+1, NX), (N, NU), (N, NU): at the end of the room, while nothing is solved */",
+            "    double *X, *U, *beside; /* as x and u of the workspace: the end of its room, while nothing is solved */",
             "    double gains[N * NU * NZ];",
             *made,
             "} Solve;",

@@ -137,7 +137,7 @@ static int judge(Solve *b, double *X, double *U, double *cost, double *violation
     b->follow.X = X; b->follow.U = U;
     b->arena.next = b->arena_begin;
     LOCAL(Lanes, s, &b->follow);
-    if (!start(s, &b->follow)) return 0;
+    if (!s || !start(s, &b->follow)) return 0;
     enter_iterate(s, 0, 0);
     *violation = swept(s, 0, 0, SET(0.0), &caught).violation;
     *cost = 0;
@@ -287,7 +287,7 @@ static int starts_inside(Solve *b, const double *x) {
     b->follow.X = b->X; b->follow.U = b->U;
     b->arena.next = b->arena_begin;
     LOCAL(Lanes, s, &b->follow);
-    if (!start(s, &b->follow)) return 0;
+    if (!s || !start(s, &b->follow)) return 0;
     enter_problem(s, 0, 0);
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;

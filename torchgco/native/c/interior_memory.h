@@ -26,6 +26,7 @@ static inline int64_t next_of(const Barrier *t, int equality, int64_t i) {
     return i;
 }
 
+/* Those of all rows, where an exported solver has them. */
 static const double *multipliers_of(const Problem *p) {
     for (int64_t i = 0; i < p->constraints; i++) if (p->constraint[i].lam) return p->constraint[i].lam;
     return NULL;
