@@ -57,7 +57,7 @@ TGCO_BETWEEN_UNITS I factor(Barrier *t, I open) {
         if (stops && !any(open & good)) return good;
         for (int j = 0; j < NU; j++) for (int i = 0; i < NX; i++) K[j * NZ + i] = -Y[j * NX + i];
         solve_upper(L, K, NZ, NX);
-        for (int i = 0; i < NX; i++) for (int l = i; l < NX; l++) {
+        for (int l = 0; l < NX; l++) for (int i = 0; i <= l; i++) {
             V entry = Q[i * S + l];
             for (int j = 0; j < NU; j++) SUBTRACT(entry, Y[j * NX + i], Y[j * NX + l]);
             P[ENTRY(l, i)] = ahead[i * NX + l] = ahead[l * NX + i] = entry;

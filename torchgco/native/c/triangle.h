@@ -21,7 +21,8 @@ static inline void fold(IN upper, OUT lower, int n) {
 static inline void add_product(IN lower, IN x, OUT y, int n) {
     for (int i = 0; i < n; i++) {
         V sum = y[i];
-        for (int j = 0; j < n; j++) ADD(sum, lower[j <= i ? ENTRY(i, j) : ENTRY(j, i)], x[j]);
+        for (int j = 0; j < i; j++) ADD(sum, lower[ENTRY(i, j)], x[j]);
+        for (int j = i, at = ENTRY(i, i); j < n; at += ++j) ADD(sum, lower[at], x[j]); /* down a column */
         y[i] = sum;
     }
 }
