@@ -345,7 +345,7 @@ def _structure(K: int, made: list[str]) -> str:
             "    double mu, error, theta, falls, cost;",
             "    int64_t iterations;",
             "    int32_t status;",
-            "    double *X, *U, *beside; /* as x and u of the workspace: the end of its room, while nothing is solved */",
+            "    double *X, *U, *beside; /* as x and u: the end of the room, while nothing is solved */",
             "    double gains[N * NU * NZ];",
             *made,
             "} Solve;",
