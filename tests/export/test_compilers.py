@@ -16,7 +16,7 @@ from torchgco import Spheres, StateBounds
 pytestmark = needs_compiler
 NATIVE = "-march=native"
 # Bytes of text of gcc 12 -Os and of the workspace on 64 bits, by problem: a page of results has more.
-SIZES = {"bounds": (50_293, 45_264), "discs": (52_706, 37_880)}
+SIZES = {"bounds": (51_534, 27_016), "discs": (53_841, 23_120)}
 GROWTH = 1.05
 
 
@@ -110,8 +110,8 @@ def test_sizes_do_not_grow(kind: str, tmp_path: Path) -> None:
     said("gcc", "-c", "size.c", "-o", "size.o", folder=folder)
     workspace = int(said("size", "size.o", folder=folder).splitlines()[1].split()[2]) // 4
     assert text <= GROWTH * SIZES[kind][0] and workspace <= GROWTH * SIZES[kind][1], (text, workspace)
-    told = int(re.search(r"car_workspace \| ([\d,]+)", (folder / "README.md").read_text())[1].replace(",", ""))
-    assert 0 <= told - workspace <= 64
+    (told,) = re.findall(r"car_workspace \| ([\d,]+)", (folder / "README.md").read_text())
+    assert 0 <= int(told.replace(",", "")) - workspace <= 64
 
 
 @pytest.mark.slow

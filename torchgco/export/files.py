@@ -15,7 +15,7 @@ from torchgco.compiled import Compiled, compile
 from torchgco.dynamics.names import controls_of, states_of
 from torchgco.export.numbers import Changing, Member
 from torchgco.export.single import single
-from torchgco.export.source import HERE, Solver, replaced, table
+from torchgco.export.source import HERE, Solver, firsts, replaced, table
 from torchgco.native.codegen.emit import literal
 from torchgco.native.interior import Kept
 
@@ -147,24 +147,24 @@ def _header(exported: Exported) -> str:
         f"    double {m.name}[{m.size}]; /* {' x '.join(map(str, m.shape))}: {m.full} */"
         for m in exported.changing.members
     ]
-    lam = [f"    double lam_{i}[{count}];" for i, count in exported.solver.multipliers.items()]
+    lam = sum(exported.solver.multipliers.values())
     return _filled(
         "controller.h", exported, **exported.words, TITLE=exported.title, NX=p.n, NU=p.m, N=p.N, DT=exported.stage,
         STAGES=float(exported.receding), STATUSES="\n".join(statuses),
         NUMBERS="\n".join(members) or "    double none; /* no number may change */",
         MAX_ITERATIONS=exported.compiled.interior.max_iterations, SIZE_X=X, SIZE_U=U, SIZE_K=K,
-        MULTIPLIERS="\n".join(lam), ROOM=exported.solver.room,
+        MULTIPLIERS=f"    double lam[{lam}];" if lam else "", ROOM=exported.solver.room,
     )  # fmt: skip
 
 
 def _code(exported: Exported) -> str:
     p, solver = exported.kept.problem, exported.solver
-    none = [f"    memset(w->lam_{i}, 0, sizeof w->lam_{i});" for i in solver.multipliers]
+    none = "    memset(w->lam, 0, sizeof w->lam);" if solver.multipliers else "    (void)w;"
     shifts = [
-        f"        shift(w->lam_{i}, b->constraints[{i}].place, N + 1, {p.row_shapes[i][1]}, by);"
-        for i in solver.multipliers
+        f"        shift(w->lam + {first}, b->constraints[{i}].place, N + 1, {p.row_shapes[i][1]}, by);"
+        for i, first in firsts(solver.multipliers).items()
     ]
-    parts = {"NO_MULTIPLIERS": "\n".join(none) or "    (void)w;", "SHIFTS": "\n".join(shifts)}
+    parts = {"NO_MULTIPLIERS": none, "SHIFTS": "\n".join(shifts)}
     head = HEAD.format(version=VERSION)
     needs = NEEDS if exported.number == 8 else ""
     return (

@@ -142,7 +142,7 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest:
     count = _count(kept)
     made_numbers = sum(kept_by(how)[address].numel() for address in changing.copied)
     numbers = count + 2 * FILTERED + _solve_numbers(problem) + made_numbers
-    room = _structures(K) + -(-numbers * number // 8)
+    room = structure_numbers(K) + -(-numbers * number // 8)
     texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
@@ -171,13 +171,14 @@ def _kinds(kept: Kept) -> set[c.Kind]:
 
 
 def _count(kept: Kept) -> int:
-    """How many numbers a solve has room for."""
+    """How many numbers a solve needs room for beside those of its problem."""
     function = kept.library.tgco_room
     function.restype = ctypes.c_int64
-    return int(function(ctypes.byref(kept.how)))
+    alone = kept.packed.copy({"arena": 1})
+    return int(function(ctypes.byref(kept.how.copy({"of": alone}))))
 
 
-def _structures(K: int) -> int:
+def structure_numbers(K: int) -> int:
     """The size of all structures of a step without arrays of numbers, in doubles, at most."""
     size = lambda kind: -(-ctypes.sizeof(kind) // 8)
     own = size(c.Interior) + 2 * size(c.Problem) + max(1, K) * size(c.Constraint)
@@ -187,14 +188,20 @@ def _structures(K: int) -> int:
 def _solve_numbers(problem: Problem) -> int:
     """How many numbers the arrays of the structure Solve have, but for those that are made."""
     N, n, m = problem.N, problem.n, problem.m
-    stage = (n + m) * (n + m) + (n + m) * n + m * n
-    return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1)
+    stage = (n + m) * (n + m) + (n + m) * n + n * n
+    return (stage if stage > ON_STACK else 0) + N * m * (n + 1)
+
+
+def firsts(multipliers: dict[int, int]) -> dict[int, int]:
+    """Where the multipliers of constraints begin, by their places: those of one come after those of the one before."""
+    counts = list(multipliers.values())
+    return {i: sum(counts[:j]) for j, i in enumerate(multipliers)}
 
 
 def _places(kept: Kept, changing: Changing, multipliers: dict[int, int]) -> dict[int, str]:
     """Where what C reads and writes lies, by address."""
     at = lambda tensor: tensor.data_ptr()
-    places = {at(kept.lam[i]): f"w->lam_{i}" for i in multipliers}
+    places = {at(kept.lam[i]): f"w->lam + {first}" for i, first in firsts(multipliers).items()}
     places |= {address: f"numbers + {first}" for address, first in changing.shared.items()}
     places |= {address: f"b->made_{j}" for j, address in enumerate(changing.copied)}
     scalars = {"mu": kept.barrier, "status": kept.status, "iterations": kept.iterations}
@@ -262,7 +269,10 @@ def _bound(rows: list[str], problem: str, how: str, changing: Changing, made: li
         f"    b->rest = {rest};",
         "    b->arena_begin = (unsigned char *)(b + 1);",
         "    b->arena.next = b->arena_begin;",
-        "    b->arena.end = (unsigned char *)w->room + sizeof w->room;",
+        "    b->arena_end = (unsigned char *)w->room + sizeof w->room;",
+        "    b->X = (double *)(void *)b->arena_end - ((N + 1) * NX + 2 * N * NU);",
+        "    b->U = b->X + (N + 1) * NX; b->beside = b->U + N * NU;",
+        "    b->arena.end = (unsigned char *)b->X;",
         "    b->arena.seconds = w->clock;",
         "}",
     ]
@@ -327,7 +337,7 @@ def _structure(K: int, made: list[str]) -> str:
             "/* What a step works with, at the beginning of a workspace's room. */",
             "typedef struct {",
             "    Arena arena;",
-            "    unsigned char *arena_begin;",
+            "    unsigned char *arena_begin, *arena_end;",
             "    Interior how;",
             "    Problem problem, follow; /* follow: of rollouts, and of what they are worth */",
             f"    Constraint constraints[{max(1, K)}];",
@@ -335,7 +345,8 @@ def _structure(K: int, made: list[str]) -> str:
             "    double mu, error, theta, falls, cost;",
             "    int64_t iterations;",
             "    int32_t status;",
-            "    double X[(N + 1) * NX], U[N * NU], gains[N * NU * NZ], beside[N * NU];",
+            "    double *X, *U, *beside; /* as x and u: the end of the room, while nothing is solved */",
+            "    double gains[N * NU * NZ];",
             *made,
             "} Solve;",
         ]

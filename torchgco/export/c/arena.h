@@ -3,6 +3,8 @@
 #include "model.h"
 #include "stack.h"
 
+#define IN_PLACE(data) ((Numbers)(data))
+
 static void *take(const Problem *p, size_t bytes) {
     Arena *arena = p->arena;
     size_t whole = (bytes + sizeof(double) - 1) / sizeof(double) * sizeof(double);

@@ -137,7 +137,7 @@ static int judge(Solve *b, double *X, double *U, double *cost, double *violation
     b->follow.X = X; b->follow.U = U;
     b->arena.next = b->arena_begin;
     LOCAL(Lanes, s, &b->follow);
-    if (!start(s, &b->follow)) return 0;
+    if (!s || !start(s, &b->follow)) return 0;
     enter_iterate(s, 0, 0);
     *violation = swept(s, 0, 0, SET(0.0), &caught).violation;
     *cost = 0;
@@ -148,7 +148,7 @@ static int judge(Solve *b, double *X, double *U, double *cost, double *violation
 
 /* Rollout of U, or with feedback of U + K (x - X), into b->X, b->U, from the states x. */
 static void follow(Solve *b, const double *x, const double *X, const double *U, int feedback) {
-    memcpy(b->X, X, sizeof b->X); memcpy(b->U, U, sizeof b->U);
+    memcpy(b->X, X, (N + 1) * NX * sizeof *X); memcpy(b->U, U, N * NU * sizeof *U);
     memcpy(b->X, x, NX * sizeof *x);
     b->follow.X = b->X; b->follow.U = b->U;
     roll_out(&b->follow, 0, 1, feedback);
@@ -183,7 +183,9 @@ static int run(NAME_workspace *w, Solve *b, How how, double until) {
     b->mu = how.mu; b->iterations = 0; b->status = RUNNING; b->falls = 0;
     b->arena.next = b->arena_begin;
     memset(b->gains, 0, sizeof b->gains);
+    b->arena.end = b->arena_end;
     if (!tgco_interior(&b->how, 0, 1)) b->status = NON_FINITE;
+    b->arena.end = (unsigned char *)b->X;
     w->iterations += (int)b->iterations;
     if (b->status == MAX_ITERATIONS && w->max_iterations > 0 && w->iterations >= w->max_iterations) b->status = TIME_LIMIT;
     for (int i = 0; i < N * NU * NZ; i++) if (!(b->gains[i] - b->gains[i] == 0)) b->gains[i] = 0;
@@ -285,7 +287,7 @@ static int starts_inside(Solve *b, const double *x) {
     b->follow.X = b->X; b->follow.U = b->U;
     b->arena.next = b->arena_begin;
     LOCAL(Lanes, s, &b->follow);
-    if (!start(s, &b->follow)) return 0;
+    if (!s || !start(s, &b->follow)) return 0;
     enter_problem(s, 0, 0);
     for (int64_t i = 0; i < s->of->constraints; i++) {
         const Constraint *con = s->of->constraint + i;
@@ -331,7 +333,7 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
     int solved = cold(w, b, x, until), again = 0;
     cost = b->cost;
     for (int i = 0; i < 2 && solved && b->falls > 0; i++) {
-        memcpy(b->beside, b->U, sizeof b->U);
+        memcpy(b->beside, b->U, sizeof w->u);
         step_beside(b, shares[i], b->beside);
         memcpy(w->u, b->beside, sizeof w->u);
         follow(b, x, w->x, w->u, 0);

@@ -2,7 +2,7 @@
 #pragma once
 #include "problem.h"
 
-#define STAGE_NUMBERS (S * S + S * NX + NU * NX)
+#define STAGE_NUMBERS (S * S + S * NX + NX * NX)
 #define LOCAL(type, name, p) type *name = (type *)take(p, sizeof(type))
 
 typedef struct {

@@ -12,4 +12,6 @@ static void *take(const Problem *p, size_t bytes) {
 
 static Numbers take_numbers(const Problem *p, int64_t count) { return take(p, count * sizeof(V)); }
 
+#define IN_PLACE(data) NONE /* never: lanes are beside each other */
+
 static void give(const Problem *p, void *memory) { free(memory); }

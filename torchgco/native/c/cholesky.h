@@ -1,19 +1,19 @@
 /* The Cholesky factor of the controls' block of a stage's Hessian, and triangular systems with it. */
 #pragma once
-#include "model.h"
+#include "triangle.h"
 
-/* L of L L' = H_uu, of whose upper triangle in H (S, S) is read; L's diagonal is inverted. Pivots go into `pivots`. */
+/* L of L L' = H_uu, of which the upper triangle in H (S, S) is read; L's diagonal is inverted. Pivots go into `pivots`. */
 static inline void factor_controls(IN H, OUT L, OUT pivots) {
     for (int j = 0; j < NU; j++) {
         V pivot = H[(NX + j) * S + NX + j];
-        for (int i = 0; i < j; i++) SUBTRACT(pivot, L[j * NU + i], L[j * NU + i]);
+        for (int i = 0; i < j; i++) SUBTRACT(pivot, L[ENTRY(j, i)], L[ENTRY(j, i)]);
         pivots[j] = pivot;
         V inverse = SET(1.0) / tgco_sqrt(pivot);
-        L[j * NU + j] = inverse;
+        L[ENTRY(j, j)] = inverse;
         for (int i = j + 1; i < NU; i++) {
             V entry = H[(NX + j) * S + NX + i];
-            for (int a = 0; a < j; a++) SUBTRACT(entry, L[i * NU + a], L[j * NU + a]);
-            L[i * NU + j] = entry * inverse;
+            for (int a = 0; a < j; a++) SUBTRACT(entry, L[ENTRY(i, a)], L[ENTRY(j, a)]);
+            L[ENTRY(i, j)] = entry * inverse;
         }
     }
 }
@@ -22,8 +22,8 @@ static inline void factor_controls(IN H, OUT L, OUT pivots) {
 static inline void solve_lower(IN L, OUT Y, int width, int count) {
     for (int j = 0; j < NU; j++) {
         OUT row = Y + j * width;
-        for (int a = 0; a < j; a++) for (int i = 0; i < count; i++) SUBTRACT(row[i], L[j * NU + a], Y[a * width + i]);
-        for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
+        for (int a = 0; a < j; a++) for (int i = 0; i < count; i++) SUBTRACT(row[i], L[ENTRY(j, a)], Y[a * width + i]);
+        for (int i = 0; i < count; i++) row[i] *= L[ENTRY(j, j)];
     }
 }
 
@@ -32,7 +32,7 @@ static inline void solve_upper(IN L, OUT Y, int width, int count) {
     for (int j = NU - 1; j >= 0; j--) {
         OUT row = Y + j * width;
         for (int a = j + 1; a < NU; a++)
-            for (int i = 0; i < count; i++) SUBTRACT(row[i], L[a * NU + j], Y[a * width + i]);
-        for (int i = 0; i < count; i++) row[i] *= L[j * NU + j];
+            for (int i = 0; i < count; i++) SUBTRACT(row[i], L[ENTRY(a, j)], Y[a * width + i]);
+        for (int i = 0; i < count; i++) row[i] *= L[ENTRY(j, j)];
     }
 }

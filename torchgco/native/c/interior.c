@@ -14,7 +14,7 @@ TGCO_LARGE void settle(Barrier *t, Track *k, I of, int anew) {
         sort_rows(t, of);
         EACH_ROW(t, 0, q) {
             V slack = most(-t->c[q], SET(how->bound_push) * t->room[q]);
-            if (t->some_out) slack = tgco_choose(t->out[q], SET(1.0), slack);
+            if (t->some_out) slack = tgco_choose(is_out(t, q), SET(1.0), slack);
             t->s[q] = tgco_choose(of, slack, t->s[q]);
         }
     }
@@ -119,7 +119,7 @@ TGCO_LARGE void hold_loose(Barrier *t, I of) {
             int v = con->variable[j];
             int64_t q = row_of(t, i, k) + j;
             V costs = v < NX ? t->dx[k * NX + v] : t->du[k * NU + v - NX];
-            I loose = of & NOT(t->out[q]) & (costs * most(t->s[q], SET(1.0)) <= SET(t->how->held));
+            I loose = of & NOT(is_out(t, q)) & (costs * most(t->s[q], SET(1.0)) <= SET(t->how->held));
             if (k == 0 && v < NX) loose &= t->is_free ? tgco_is(t->is_free[v]) : of & NOT(of); /* nothing moves a given one */
             t->z[q] = tgco_choose(loose, SET(1.0), t->z[q]);
             some |= loose;
@@ -143,8 +143,7 @@ TGCO_LARGE void begin(Barrier *t, Track *k, I of) {
     k->left = tgco_choose(of, SET(INFINITY), k->left);
     t->shift = tgco_choose(of, zero, t->shift); /* gains of a problem that ends at once don't know the lane's last one */
     k->restoring &= NOT(of); k->watching &= NOT(of);
-    k->relaxed &= NOT(of); k->presses &= NOT(of);
-    if (t->some_relaxed) for (int64_t q = 0; q < t->rows; q++) t->relaxed[q] = tgco_choose(of, zero, t->relaxed[q]);
+    t->relaxed &= NOT(of); k->presses &= NOT(of);
     t->soft = tgco_choose(of, SET(how->jacobian_regularization_value), t->soft);
     for (int l = 0; l < LANES; l++) if (LANE(of, l)) k->failures[l] = k->shortened[l] = 0;
     for (int64_t i = 0; i < p->constraints; i++) {
@@ -195,7 +194,7 @@ TGCO_LARGE void lower_barrier(Barrier *t, Track *k, I running, V dual, V primal,
         lowered |= low;
     }
     if (!any(lowered)) return;
-    V cost = values(t, lowered, t->lanes.X, t->lanes.U, t->cn, t->gapn);
+    V cost = cost_along(t, lowered, t->lanes.X, t->lanes.U);
     k->phi = tgco_choose(lowered, cost - t->mu * logarithms(t, t->s), k->phi);
     for (int l = 0; l < LANES; l++) if (LANE(lowered, l)) k->pairs[l] = 0;
 }
@@ -226,7 +225,7 @@ TGCO_LARGE I soften(Barrier *t, const Track *k, I moving) {
     for (;;) {
         V largest = SET(0.0);
         EACH_ROW(t, 1, q) largest = most(tgco_fabs(t->z[q] + t->dz[q]), largest);
-        if (t->some_out) EACH_ROW(t, 0, q) largest = most(tgco_if(t->fixes[q], tgco_fabs(t->z[q] + t->dz[q])), largest);
+        if (t->some_out) EACH_ROW(t, 0, q) largest = most(tgco_if(is_fixed(t, q), tgco_fabs(t->z[q] + t->dz[q])), largest);
         I large = moving & (largest > SET(how->explodes) * t->raised) & (t->soft < SET(how->softest));
         if (!any(large)) return moving;
         t->soft = tgco_choose(large, SET(how->soft_growth) * t->soft, t->soft);
@@ -274,7 +273,7 @@ TGCO_LARGE I barrier_counts(Barrier *t, I of, V *left) {
     *left = SET(0.0);
     if (t->how->smoothing > 0) return of & NOT(of); /* it is to stay */
     if (!any(of)) return of;
-    V cost = values(t, of, t->lanes.X, t->lanes.U, t->cn, t->gapn), size;
+    V cost = cost_along(t, of, t->lanes.X, t->lanes.U), size;
     EACH_ROW(t, 0, q) *left += by_role(t, q, t->s[q] * t->z[q], SET(0.0)) + tgco_fabs(t->z[q] * t->r[q]);
     EACH_ROW(t, 1, q) *left += tgco_fabs(t->z[q] * t->r[q]);
     for (int l = 0; l < LANES; l++) {
@@ -308,10 +307,10 @@ TGCO_LARGE I find_solved(Barrier *t, Track *k, I running, V error, V primal) {
 TGCO_LARGE void relax(Barrier *t, Track *k, I running) {
     V largest = SET(0.0);
     EACH_ROW(t, 0, q) largest = most(t->z[q], largest);
-    I lacks = running & (largest > SET(t->how->explodes) * t->raised) & NOT(k->relaxed) & NOT(k->watching);
+    I lacks = running & (largest > SET(t->how->explodes) * t->raised) & NOT(t->relaxed) & NOT(k->watching);
     if (!any(lacks)) return;
-    k->relaxed |= lacks;
     visit_rows(t, lacks, 1, CALLED(loosen));
+    t->relaxed |= lacks;
     settle(t, k, lacks, 0);
     renew(t, lacks);
 }
@@ -323,10 +322,10 @@ TGCO_LARGE I readmit(Barrier *t, Track *k, I of, double admitted) {
     t->admitted = admitted;
     EACH_ROW(t, 0, q) broken |= of & is_broken(t, q);
     if (!any(broken)) return changed;
-    EACH_ROW(t, 0, q) t->dz[q] = tgco_truth(t->out[q]); /* no step is under way */
+    EACH_ROW(t, 0, q) t->dz[q] = t->role[q]; /* no step is under way */
     visit_rows(t, broken, 0, CALLED(come_in));
-    EACH_ROW(t, 0, q) changed |= t->dz[q] != tgco_truth(t->out[q]);
-    if (!any(changed)) return changed;
+    EACH_ROW(t, 0, q) changed |= t->dz[q] != t->role[q];
+    if (!any(changed)) { expand(t); return changed; } /* rows were visited in the model's memory */
     for (int l = 0; l < LANES; l++) if (LANE(changed, l)) {
         LANE(t->mu, l) = first_barrier(t, l);
         LANE(k->watching, l) = k->shortened[l] = 0;
@@ -345,7 +344,6 @@ TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error)
     if (t->some_out) readmit(t, k, running, how->theta_max_fact); /* beyond which no residual is accepted */
     relax(t, k, running);
     residuals(t, t->c, t->s, t->r);
-    memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     expand(t);
     errors(t, &dual, &primal, &scale_z);
     *error = most(most(dual, primal), complementarity(t, SET(how->smoothing) * t->scale) * scale_z);
@@ -370,6 +368,7 @@ TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error)
     running &= NOT(ended) & NOT(astray);
     if (!any(running)) return ended;
     lower_barrier(t, k, running, dual, primal, scale_z);
+    memcpy(t->aim, t->gap, t->lanes.of->N * NX * sizeof(V));
     I moving = factor_shifted(t, k, running, running);
     solve(t);
     solve_rows(t);

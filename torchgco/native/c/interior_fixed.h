@@ -31,7 +31,8 @@ static void measure_room(Barrier *t, I of, int64_t i, int64_t k) {
             *room = tgco_choose(of, least(half, SET(1.0)), *room);
         }
         I same = of & (half == SET(0.0));
-        t->out[q + j] |= same; t->out[q + l] |= same; t->fixes[q + j] |= same;
+        t->role[q + j] = tgco_choose(same, SET(FIXED), t->role[q + j]);
+        t->role[q + l] = tgco_choose(same, SET(BESIDE), t->role[q + l]);
     }
 }
 
@@ -44,7 +45,7 @@ static void vary_controls(const Barrier *t, int64_t k, OUT du) {
         if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
         for (int j = 0; j < con->rows; j++) if (con->variable[j] >= NX) {
             OUT own = du + con->variable[j] - NX;
-            *own = tgco_if(NOT(t->fixes[row_of(t, i, k) + j]), *own);
+            *own = tgco_if(NOT(is_fixed(t, row_of(t, i, k) + j)), *own);
         }
     }
 }
@@ -53,7 +54,7 @@ static void vary_controls(const Barrier *t, int64_t k, OUT du) {
    within rounding of its terms is none. */
 TGCO_LARGE void find_moved(const Barrier *t, int64_t i, int64_t k, IN x, IN u, const V *z) {
     int rows = t->lanes.of->constraint[i].rows;
-    Truths moves = t->moves + row_of(t, i, k);
+    Numbers moves = t->moves + row_of(t, i, k);
     OUT change = t->across[0]; OUT part = t->across[1]; OUT terms = t->across[2]; V own[S];
     along(t, i, k, x, u, z, change);
     for (int j = 0; j < rows; j++) terms[j] = SET(0.0);
@@ -62,8 +63,8 @@ TGCO_LARGE void find_moved(const Barrier *t, int64_t i, int64_t k, IN x, IN u, c
         along(t, i, k, x, u, own, part);
         for (int j = 0; j < rows; j++) terms[j] += tgco_fabs(part[j]);
     }
-    V rounding = SET(ROUNDINGS * t->how->last_bit);
-    for (int j = 0; j < rows; j++) moves[j] |= NOT(tgco_fabs(change[j]) <= rounding * terms[j]);
+    V rounding = SET(ROUNDINGS * t->how->last_bit), one = SET(1.0);
+    for (int j = 0; j < rows; j++) moves[j] = tgco_choose(tgco_fabs(change[j]) <= rounding * terms[j], moves[j], one);
 }
 
 /* Rows j of constraint i at knot k, in the lanes `of`, with less room than a slack is given at first, or than a guess is
@@ -127,7 +128,7 @@ TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
     int some = 0;
     for (int64_t k = 0; k <= p->N; k++) for (int64_t i = 0; i < p->constraints; i++) some |= is_visited(t, of, all, i, k);
     if (!some) return;
-    memset(t->moves, 0, t->rows * sizeof(I));
+    memset(t->moves, 0, t->rows * sizeof(V));
     find_nearby(t);
     for (int near = 1; near >= 0; near--) {
         IN X = near ? s->Xn : s->X; IN U = near ? s->Un : s->U;
@@ -157,29 +158,30 @@ TGCO_LARGE void visit_rows(Barrier *t, I of, int all, CALLABLE(Visit) visit) {
 static void leave_out(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    Truths moves = t->moves + q;
+    Numbers moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
         I tight = is_tight(t, of, i, k, j), is_state = of & NOT(of);
         if (is_kind(con, BOUNDS) && con->variable[j] < NX) is_state = NOT(is_state);
-        t->out[q + j] |= tight & NOT(moves[j]);
-        t->fixes[q + j] &= NOT(of) | moves[j] | NOT(is_state); /* controls that are fixed weren't varied */
+        I still = NOT(tgco_is(moves[j])), fixed = is_fixed(t, q + j);
+        V role = tgco_choose(tight & still & NOT(is_out(t, q + j)), SET(LEFT_OUT), t->role[q + j]);
+        t->role[q + j] = tgco_choose(of & still & is_state & fixed, SET(BESIDE), role); /* fixed controls weren't varied */
     }
 }
 
 /* Where row q, which was left out, is violated by more than is admitted. Of bounds that coincide none is, as an equality
    stands for both. */
 static inline I is_broken(const Barrier *t, int64_t q) {
-    return t->out[q] & (t->room[q] > SET(0.0)) & (t->c[q] > SET(t->admitted));
+    return (t->role[q] == SET(LEFT_OUT)) & (t->c[q] > SET(t->admitted));
 }
 
 /* Violated rows that were left out, but that something moves now, come into the barrier. */
 static void come_in(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
-    Truths moves = t->moves + q;
+    Numbers moves = t->moves + q;
     for (int j = 0; j < con->rows; j++) {
-        I in = of & is_broken(t, q + j) & moves[j];
-        t->out[q + j] &= NOT(in);
+        I in = of & is_broken(t, q + j) & tgco_is(moves[j]);
+        t->role[q + j] = tgco_choose(in, SET(INSIDE), t->role[q + j]);
         t->s[q + j] = tgco_choose(in, SET(t->how->bound_push), t->s[q + j]);
     }
 }
@@ -194,18 +196,17 @@ static void loosen(Barrier *t, I of, int64_t i, int64_t k, const V *z) {
     along(t, i, k, s->X + k * NX, k < s->of->N ? s->U + k * NU : 0, z, change);
     for (int j = 0; j < con->rows; j++, q++) {
         V room = most_room * least(tgco_fabs(change[j]), t->room[q]);
-        room = tgco_if(of & NOT(t->out[q]) & tgco_finite(room), room);
-        t->relaxed[q] = tgco_choose(of, room, t->relaxed[q]);
+        room = tgco_if(of & NOT(is_out(t, q)) & tgco_finite(room), room);
+        t->room[q] = tgco_choose(of, room, t->room[q]);
         t->s[q] += room;
     }
-    t->some_relaxed = 1;
 }
 
 /* Which rows of the lanes `of`, whose iterate and values c are new, stay out of the barrier. */
 TGCO_LARGE void sort_rows(Barrier *t, I of) {
     const Problem *p = t->lanes.of;
     for (int64_t q = 0; q < t->rows; q++) {
-        t->out[q] &= NOT(of); t->fixes[q] &= NOT(of);
+        t->role[q] = tgco_choose(of, SET(INSIDE), t->role[q]);
         t->room[q] = tgco_choose(of, SET(1.0), t->room[q]);
     }
     for (int64_t k = 0; k <= p->N; k++)
@@ -213,7 +214,7 @@ TGCO_LARGE void sort_rows(Barrier *t, I of) {
             if (p->constraint[i].place[k] != NOWHERE && !p->constraint[i].equality) measure_room(t, of, i, k);
     visit_rows(t, of, 0, CALLED(leave_out));
     I some = of & NOT(of);
-    for (int64_t q = 0; q < t->rows; q++) some |= t->out[q];
+    for (int64_t q = 0; q < t->rows; q++) some |= is_out(t, q);
     t->some_out = any(some);
 }
 
@@ -292,9 +293,9 @@ static int some_hold(const Barrier *t, I of, int64_t i, int64_t k, IN active) {
 TGCO_LARGE void soften_rows(Barrier *t, I of, V share, IN active) {
     const Problem *p = t->lanes.of;
     int some = active ? 1 : 0;
-    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
-    for (int64_t i = 0; i < p->constraints; i++) some |= p->constraint[i].equality;
+    if (next_of(t, 1, 0) < p->constraints) some = 1;
     if (!some) return;
+    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = tgco_choose(of, SET(1.0), t->gives[q]);
     LOCAL_NUMBERS(t, squares, S * S, S * NX);
     V moves[S], zero = SET(0.0), one = SET(1.0);
     measure_costs(t);
@@ -327,7 +328,8 @@ TGCO_LARGE void soften_rows(Barrier *t, I of, V share, IN active) {
 static int breaks_rows_left_out(const Barrier *t, int l) {
     int breaks = 0;
     if (t->some_out) EACH_ROW(t, 0, q) {
-        breaks |= LANE(t->out[q], l) && !LANE(t->fixes[q], l) && !(LANE(t->c[q], l) <= t->how->constr_viol_tol);
+        double role = LANE(t->role[q], l);
+        breaks |= role != INSIDE && role != FIXED && !(LANE(t->c[q], l) <= t->how->constr_viol_tol);
     }
     return breaks;
 }
@@ -338,7 +340,7 @@ static void split_multipliers(const Barrier *t, int64_t i, int l) {
     for (int64_t first = 0; first < con->knots * con->rows; first += con->rows) {
         double *lam = con->lam + t->lanes.element[l] * con->knots * con->rows + first;
         for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
-            if (!are_a_pair(con, j, m) || !LANE(t->fixes[t->first[i] + first + j], l) || !(lam[j] < 0)) continue;
+            if (!are_a_pair(con, j, m) || LANE(t->role[t->first[i] + first + j], l) != FIXED || !(lam[j] < 0)) continue;
             lam[m] = -lam[j];
             lam[j] = 0;
         }
@@ -355,7 +357,7 @@ static void join_multipliers(Barrier *t, I of) {
             for (int j = 0; j < con->rows; j++) for (int m = j + 1; m < con->rows; m++) {
                 if (!are_a_pair(con, j, m)) continue;
                 OUT z = t->z + first;
-                z[j] = tgco_choose(of & t->fixes[first + j], z[j] - z[m], z[j]);
+                z[j] = tgco_choose(of & is_fixed(t, first + j), z[j] - z[m], z[j]);
             }
     }
 }

@@ -17,9 +17,10 @@
 /* What a solve needs beside the interior point's own memory. */
 typedef struct {
     Numbers active, give; /* (rows): 1 where a row holds, and its D */
-    Numbers H;         /* (N+1, S, S): curvatures without what holds the rows, upper triangles */
+    Numbers H;         /* (N+1, S, S): curvatures without what holds the rows, triangles */
     Numbers a, b, c;   /* (N+1, S), (N, NX), (rows): a right hand side */
     Numbers z, y, v;   /* the same: its solution */
+    Numbers gives, along; /* (rows): what the interior point has of equalities alone, and where the model it needs again lies */
     V sigma;
 } System;
 
@@ -39,11 +40,14 @@ static void stiffen(Barrier *t, const System *of) {
 /* Adds the slopes of all rows, times their sigma r, to g[1], and their sigma's curvature to H. */
 static void add_all_rows(Barrier *t) {
     const Problem *p = t->lanes.of;
+    LOCAL_NUMBERS(t, H, 0, S * S);
     t->objective = SET(0.0); /* else rows would add multipliers, and their own curvature once more */
     for (int64_t k = 0; k <= p->N; k++) {
         IN x = t->lanes.X + k * NX; IN u = k < p->N ? t->lanes.U + k * NU : 0;
+        unfold(t->H + k * TRIANGLE(S), H, S);
         for (int64_t i = 0; i < p->constraints; i++)
-            if (p->constraint[i].place[k] != NOWHERE) add_rows(t, i, k, x, u);
+            if (p->constraint[i].place[k] != NOWHERE) add_rows(t, i, k, x, u, H);
+        fold(H, t->H + k * TRIANGLE(S), S);
     }
     t->objective = SET(1.0);
 }
@@ -62,11 +66,12 @@ TGCO_LARGE I factor_kkt(Barrier *t, System *of, const Kkt *how) {
     expand(t);
     adjoin(t, all, how->K ? t->lanes.G : NONE);
     expand(t);
-    memcpy(of->H, t->H, (N + 1) * S * S * sizeof(V));
+    memcpy(of->H, t->H, (N + 1) * TRIANGLE(S) * sizeof(V));
     for (int64_t k = 0; k <= N; k++)
-        for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(t->H[k * S * S + i * S + i]), largest);
+        for (int i = 0; i < (k < N ? S : NX); i++) largest = most(tgco_fabs(of->H[k * TRIANGLE(S) + ENTRY(i, i)]), largest);
     of->sigma = SET(how->stiff) * largest;
     soften_rows(t, all, SET(how->slight) * largest, of->active);
+    memcpy(t->H, of->H, (N + 1) * TRIANGLE(S) * sizeof(V)); /* where costs of moves were measured */
     stiffen(t, of);
     add_all_rows(t);
     return factor(t, NOT(all));
@@ -89,13 +94,13 @@ TGCO_LARGE void along_rows(Barrier *t) {
 TGCO_LARGE void find_open(Barrier *t, const System *of) {
     int64_t N = t->lanes.of->N;
     for (int64_t k = 0; k <= N; k++) {
-        IN H = of->H + k * S * S; IN z = of->z + k * S; IN next = of->z + (k + 1) * S;
+        IN H = of->H + k * TRIANGLE(S); IN z = of->z + k * S; IN next = of->z + (k + 1) * S;
         OUT g = t->g[1] + k * S; V ahead[NX], back[S];
         for (int i = 0; i < S; i++) {
             g[i] = of->a[k * S + i];
             t->g[2][k * S + i] = back[i] = SET(0.0);
             if (k == N && i >= NX) { g[i] = SET(0.0); continue; }
-            for (int j = 0; j < (k < N ? S : NX); j++) ADD(g[i], H[i < j ? i * S + j : j * S + i], z[j]);
+            for (int j = 0; j < (k < N ? S : NX); j++) ADD(g[i], H[i < j ? ENTRY(j, i) : ENTRY(i, j)], z[j]);
         }
         if (k > 0) for (int i = 0; i < NX; i++) g[i] -= of->y[(k - 1) * NX + i];
         if (k == N) break;
@@ -163,7 +168,7 @@ TGCO_LARGE void find_responses(const Barrier *t, const Kkt *how, int64_t at, int
         memcpy(spread, turned, sizeof spread);
         for (int j = 0; j < NU; j++) {
             for (int i = 0; i < S; i++) z[i] = SET(i == NX + j ? 1.0 : 0.0);
-            solve_upper(t->L + k * NU * NU, z + NX, 1, 1);
+            solve_upper(t->L + k * TRIANGLE(NU), z + NX, 1, 1);
             model_push(t->f + k * NJ, z, pushed);
             for (int a = 0; a < NX; a++) for (int b = 0; b < NX; b++) ADD(spread[a * NX + b], pushed[a], pushed[b]);
         }
@@ -219,9 +224,10 @@ static void enter_system(Barrier *t, System *of, const Kkt *how, int lane, int64
 static int64_t lay_out_system(System *of, const Problem *p, int64_t rows, Numbers memory) {
     int64_t N = p->N, point = (N + 1) * S, gaps = N * NX;
     Cut m = {memory, 0};
-    of->H = cut(&m, (N + 1) * S * S); of->active = cut(&m, rows); of->give = cut(&m, rows);
+    of->H = cut(&m, (N + 1) * TRIANGLE(S)); of->active = cut(&m, rows); of->give = cut(&m, rows);
     of->a = cut(&m, point); of->b = cut(&m, gaps); of->c = cut(&m, rows);
     of->z = cut(&m, point); of->y = cut(&m, gaps); of->v = cut(&m, rows);
+    of->gives = cut(&m, rows); of->along = cut(&m, rows);
     return m.used;
 }
 
@@ -246,6 +252,8 @@ int tgco_kkt(const Kkt *how, int64_t first, int64_t last) {
     Numbers memory = take_numbers(p, lay_out_system(of, p, t->rows, 0) + 1);
     if (!memory) { finish_barrier(t); return 0; }
     lay_out_system(of, p, t->rows, memory);
+    t->gives = of->gives; t->ds = of->along;
+    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = SET(1.0);
     for (int64_t at = first; at < last; at += LANES) {
         int own = last - at < LANES ? last - at : LANES; /* lanes without a problem repeat the first one */
         for (int l = 0; l < LANES; l++) {

@@ -14,30 +14,56 @@ typedef struct {
     V left;        /* the smallest complementarity so far, of those that counted */
     Pair filter[LANES][PAIRS];
     int pairs[LANES], failures[LANES], shortened[LANES], ahead[LANES];
-    I restoring, crawls, relaxed; /* relaxed: the rows are */
+    I restoring, crawls;
     I presses; /* mu falls further than the tolerance asks for: see barrier_counts */
     I watching; /* a step was taken on trial; theta, phi, slope and alpha are those before it */
 } Track;
+
+/* The first constraint from i on that holds equalities, 1, or inequalities, 0. */
+static inline int64_t next_of(const Barrier *t, int equality, int64_t i) {
+    const Problem *p = t->lanes.of;
+    while (i < p->constraints && p->constraint[i].equality != equality) i++;
+    return i;
+}
+
+/* Those of all rows, where an exported solver has them. */
+static const double *multipliers_of(const Problem *p) {
+    for (int64_t i = 0; i < p->constraints; i++) if (p->constraint[i].lam) return p->constraint[i].lam;
+    return NULL;
+}
+
+/* The model of an iterate and the step that it leads to take turns with the same memory: H and g[0] have been read when there
+   is a step, and all of the model before a trial is made; what needs the model again calls `expand`. */
+static void lay_out_turns(Barrier *t, Cut *m) {
+    Lanes *s = &t->lanes;
+    int64_t N = s->of->N, rows = t->rows;
+    Cut step = *m;
+    t->H = cut(m, (N + 1) * TRIANGLE(S)); t->g[0] = cut(m, (N + 1) * S);
+    t->f = cut(m, N * NJ + 1);
+    for (int part = 1; part < PARTS; part++) t->g[part] = cut(m, (N + 1) * S);
+    t->dx = cut(&step, (N + 1) * NX); t->du = cut(&step, N * NU);
+    t->yn = cut(&step, (N + 1) * NX); t->p = s->Xn = cut(&step, (N + 1) * NX); /* before f: 3 NX + NU <= S (S + 3) / 2 */
+    s->Un = cut(&step, N * NU); t->gapn = cut(&step, N * NX);
+    t->cn = cut(&step, rows); t->sn = cut(&step, rows); t->ds = t->moves = cut(&step, rows); t->dz = cut(&step, rows);
+    if (step.used > m->used) m->used = step.used;
+}
 
 static int64_t shape(Barrier *t, Numbers memory) {
     const Problem *p = t->lanes.of;
     int64_t N = p->N, rows = t->rows;
     Cut m = {memory, 0};
-    t->y = cut(&m, (N + 1) * NX); t->yn = cut(&m, (N + 1) * NX);
-    t->gap = cut(&m, N * NX); t->gapn = cut(&m, N * NX); t->aim = cut(&m, N * NX);
-    t->H = cut(&m, (N + 1) * S * S); t->f = cut(&m, N * NJ + 1);
+    t->y = cut(&m, (N + 1) * NX);
+    t->gap = cut(&m, N * NX); t->aim = cut(&m, N * NX);
     t->cost_slope = cut(&m, (N + 1) * S);
-    for (int part = 0; part < PARTS; part++) t->g[part] = cut(&m, (N + 1) * S);
-    t->P = cut(&m, (N + 1) * NX * NX); t->p = cut(&m, (N + 1) * NX); t->L = cut(&m, N * NU * NU);
-    if (t->how->free_start) { t->is_free = cut(&m, NX); t->L_start = cut(&m, NX * NX); }
-    t->dx = cut(&m, (N + 1) * NX); t->du = cut(&m, N * NU);
-    t->c = cut(&m, rows); t->cn = cut(&m, rows); t->s = cut(&m, rows); t->sn = cut(&m, rows); t->z = cut(&m, rows);
-    t->r = cut(&m, rows); t->ds = cut(&m, rows); t->dz = cut(&m, rows);
+    t->P = cut(&m, (N + 1) * TRIANGLE(NX)); t->L = cut(&m, N * TRIANGLE(NU));
+    if (t->how->free_start) { t->is_free = cut(&m, NX); t->L_start = cut(&m, TRIANGLE(NX)); }
+    t->c = cut(&m, rows); t->s = cut(&m, rows); t->r = cut(&m, rows);
+    t->z = cut_at(&m, p, multipliers_of(p), rows);
     for (int i = 0; i < 3; i++) t->across[i] = cut(&m, t->widest);
-    t->moves = (Truths)cut(&m, rows);
-    t->room = cut(&m, rows); t->relaxed = cut(&m, rows); t->gives = cut(&m, rows);
-    t->out = (Truths)cut(&m, rows); t->fixes = (Truths)cut(&m, rows);
-    t->kept = cut(&m, 2 * (N + 1) * NX + N * (NU + NX) + 3 * rows);
+    t->room = cut(&m, rows); t->role = cut(&m, rows);
+    if (next_of(t, 1, 0) < p->constraints) t->gives = cut(&m, rows);
+    t->kept = cut(&m, 2 * (N + 1) * NX + N * NU + 2 * rows);
+    lay_out_turns(t, &m);
     return m.used;
 }
 
@@ -51,7 +77,8 @@ static int start_barrier(Barrier *t, const Interior *how) {
     const Problem *p = how->of;
     memset(t, 0, sizeof *t);
     t->how = how;
-    if (!start(&t->lanes, p)) return 0;
+    t->lanes.of = p; t->lanes.of_barrier = 1;
+    if (!take_lanes(&t->lanes)) return 0;
     t->first = (int64_t *)take(p, (p->constraints + 1) * sizeof *t->first);
     t->rows_asked = (double **)take(p, (p->constraints + 1) * sizeof *t->rows_asked);
     if (!t->first || !t->rows_asked) { finish_barrier(t); return 0; }
@@ -65,7 +92,8 @@ static int start_barrier(Barrier *t, const Interior *how) {
     t->memory = take_numbers(p, count + 1);
     if (!t->memory) { finish_barrier(t); return 0; }
     shape(t, t->memory);
-    for (int64_t q = 0; q < t->rows; q++) t->gives[q] = SET(1.0);
+    for (int64_t i = 0; i < p->constraints; i++) t->lanes.rows[i].lam = t->z + t->first[i];
+    for (int64_t q = 0; t->gives && q < t->rows; q++) t->gives[q] = SET(1.0);
     return 1;
 }
 
@@ -85,13 +113,6 @@ TGCO_LARGE void enter_barrier(Barrier *t, int lane, int64_t e) {
 
 static inline V most(V a, V b) { return tgco_choose((a > b) | (a != a), a, b); } /* NaN stays */
 static inline V least(V a, V b) { return tgco_choose(a < b, a, b); }
-
-/* The first constraint from i on that holds equalities, 1, or inequalities, 0. */
-static inline int64_t next_of(const Barrier *t, int equality, int64_t i) {
-    const Problem *p = t->lanes.of;
-    while (i < p->constraints && p->constraint[i].equality != equality) i++;
-    return i;
-}
 
 /* For every row q of them. */
 #define EACH_ROW(t, equality, q) \
@@ -127,9 +148,8 @@ TGCO_LARGE V size_of(const Barrier *t, IN gap, IN r) {
 TGCO_LARGE void adjoin(Barrier *t, I of, IN gains) {
     const Problem *p = t->lanes.of;
     V largest = SET(0.0), q[S];
-    memset(t->yn, 0, (p->N + 1) * NX * sizeof(V));
-    for (int64_t k = p->N; k > 0; k--) {
-        OUT y = t->yn + k * NX;
+    for (int64_t k = p->N; k > 0; k--) { /* no step aims at anything yet */
+        OUT y = t->aim + (k - 1) * NX;
         for (int i = 0; i < S; i++) q[i] = SET(0.0);
         if (k < p->N) model_pull_back(y + NX, t->f + k * NJ, q);
         for (int i = 0; i < NX; i++) {
@@ -140,7 +160,8 @@ TGCO_LARGE void adjoin(Barrier *t, I of, IN gains) {
         }
     }
     I sound = largest <= SET(t->how->constr_mult_init_max) * t->raised;
-    for (int64_t i = 0; i < (p->N + 1) * NX; i++) t->y[i] = tgco_choose(of, tgco_if(sound, t->yn[i]), t->y[i]);
+    for (int i = 0; i < NX; i++) t->y[i] = tgco_choose(of, SET(0.0), t->y[i]);
+    for (int64_t i = 0; i < p->N * NX; i++) t->y[NX + i] = tgco_choose(of, tgco_if(sound, t->aim[i]), t->y[NX + i]);
 }
 
 /* Multipliers anew for the lanes `of`: those of the central path, and none of equalities. */

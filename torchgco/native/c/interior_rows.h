@@ -45,13 +45,16 @@ static inline void rows_at(const Lanes *s, int64_t i, int64_t k, IN x, IN u, OUT
     } else model_rows((int)i, x, u, at(rows->bound, &con->bound, con->place[k]), con->shared, c);
 }
 
+static inline I is_out(const Barrier *t, int64_t q) { return t->role[q] != SET(INSIDE); }
+static inline I is_fixed(const Barrier *t, int64_t q) { return t->role[q] == SET(FIXED); }
+
 /* `inside` of rows in the barrier, `fixed` of bounds that coincide, and nothing of rows that no variable moves. */
 static inline V by_role(const Barrier *t, int64_t q, V inside, V fixed) {
-    return t->some_out ? tgco_choose(t->out[q], tgco_if(t->fixes[q], fixed), inside) : inside;
+    return t->some_out ? tgco_choose(is_out(t, q), tgco_if(is_fixed(t, q), fixed), inside) : inside;
 }
 
 /* The dual regularisation of a row that holds as an equality. */
-static inline V softness(const Barrier *t, int64_t q) { return t->soft * t->gives[q]; }
+static inline V softness(const Barrier *t, int64_t q) { return t->gives ? t->soft * t->gives[q] : t->soft; }
 
 /* What row q adds: by[0] its multiplier, by[1] the condensed residual, by[2] mu's factor, and the curvature across. */
 static inline V weigh(const Barrier *t, int equality, int64_t q, V *by) {
@@ -144,14 +147,14 @@ static inline void add_solids(
 }
 
 /* Rows of a body: each ball's by its center, then by the state, with the curvature of its way. */
-static void add_body(Barrier *t, int64_t i, int64_t k, IN x) {
+static void add_body(Barrier *t, int64_t i, int64_t k, IN x, OUT H) {
     const Lanes *s = &t->lanes;
     const Constraint *con = s->of->constraint + i;
     IN numbers = at(s->rows[i].lift, &con->lift, con->place[k]);
     int64_t q = row_of(t, i, k), P = con->balls;
     V centers[MAX_ROWS], e[MAX_ROWS * S], own[PARTS * (POSITION + DIM)], square[(POSITION + DIM) * S];
     V by[PARTS * MAX_ROWS], cc[MAX_ROWS], lam[MAX_ROWS], *of_ball[PARTS];
-    Numbers g[PARTS], H = t->H + k * S * S;
+    Numbers g[PARTS];
     const int *columns;
     Ball ball;
     ball_centers(s, i, k, x, centers);
@@ -178,26 +181,26 @@ static void add_body(Barrier *t, int64_t i, int64_t k, IN x) {
 }
 #endif
 
-static inline void add_bounds(Barrier *t, int64_t i, int64_t k) {
+static inline void add_bounds(Barrier *t, int64_t i, int64_t k, OUT H) {
     const Constraint *con = t->lanes.of->constraint + i;
     int64_t q = row_of(t, i, k);
     for (int j = 0; j < con->rows; j++, q++) {
         V by[PARTS], cc = weigh(t, 0, q, by), sign = SET(con->sign[j]);
         int v = con->variable[j];
         for (int part = 0; part < PARTS; part++) ADD(t->g[part][k * S + v], sign, by[part]);
-        t->H[k * S * S + v * S + v] += cc;
+        H[v * S + v] += cc;
     }
 }
 
-/* Adds constraint i at knot k to the model of a step. */
-static inline void add_rows(Barrier *t, int64_t i, int64_t k, IN x, IN u) {
+/* Adds constraint i at knot k to the model of a step, of which H is the knot's upper triangle. */
+static inline void add_rows(Barrier *t, int64_t i, int64_t k, IN x, IN u, OUT H) {
     const Constraint *con = t->lanes.of->constraint + i;
     const Rows *rows = t->lanes.rows + i;
-    if (is_kind(con, BOUNDS)) { add_bounds(t, i, k); return; }
+    if (is_kind(con, BOUNDS)) { add_bounds(t, i, k, H); return; }
 #if DIM > 0
-    if (is_kind(con, BODY)) { add_body(t, i, k, x); return; }
+    if (is_kind(con, BODY)) { add_body(t, i, k, x, H); return; }
     if (is_solid(con)) {
-        Numbers g[PARTS], H = t->H + k * S * S;
+        Numbers g[PARTS];
         for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
         add_solids(t, g, H, con, rows, row_of(t, i, k), k, x);
         return;
@@ -214,7 +217,7 @@ static inline void add_rows(Barrier *t, int64_t i, int64_t k, IN x, IN u) {
     Numbers g[PARTS];
     for (int part = 0; part < PARTS; part++) g[part] = t->g[part] + k * S;
     IN numbers = at(rows->bound, &con->bound, con->place[k]);
-    model_bend_rows((int)i, x, u, numbers, con->shared, by, cc, lam, g, t->H + k * S * S);
+    model_bend_rows((int)i, x, u, numbers, con->shared, by, cc, lam, g, H);
 }
 
 #if DIM > 0

@@ -55,7 +55,7 @@ TGCO_LARGE void longest(const Barrier *t, V tau, V *primal, V *dual) {
         V a = -tau * t->s[q] / t->ds[q], b = -tau * t->z[q] / t->dz[q];
         *primal = tgco_choose((t->ds[q] < SET(0.0)) & (a < *primal), a, *primal);
         I falls = t->dz[q] < SET(0.0);
-        if (t->some_out) falls &= NOT(t->out[q]);
+        if (t->some_out) falls &= NOT(is_out(t, q));
         *dual = tgco_choose(falls & (b < *dual), b, *dual);
     }
 }
@@ -70,7 +70,7 @@ TGCO_LARGE void attempt(Barrier *t, I of, V alpha, V *theta, V *phi) {
     /* A slack that the row leaves more room for takes it: theta and phi fall both. */
     EACH_ROW(t, 0, q) {
         V moved = t->s[q] + alpha * t->ds[q], roomy = tgco_choose(-t->cn[q] > moved, -t->cn[q], moved);
-        t->sn[q] = t->some_out ? tgco_choose(t->out[q], t->s[q], roomy) : roomy;
+        t->sn[q] = t->some_out ? tgco_choose(is_out(t, q), t->s[q], roomy) : roomy;
     }
     V sum = SET(0.0);
     for (int64_t i = 0; i < N * NX; i++) sum += tgco_fabs(t->gapn[i]);
@@ -142,8 +142,7 @@ TGCO_LARGE void keep(Barrier *t, I of, int back) {
     int64_t N = s->of->N;
     OUT kept = t->kept;
     struct { Numbers values; int64_t count; } parts[] = {
-        {s->X, (N + 1) * NX}, {t->y, (N + 1) * NX}, {s->U, N * NU}, {t->gap, N * NX},
-        {t->c, t->rows}, {t->s, t->rows}, {t->z, t->rows}};
+        {s->X, (N + 1) * NX}, {t->y, (N + 1) * NX}, {s->U, N * NU}, {t->s, t->rows}, {t->z, t->rows}};
     for (int part = 0; part < (int)(sizeof parts / sizeof *parts); part++) {
         OUT values = parts[part].values;
         for (int64_t i = 0; i < parts[part].count; i++, kept++)
@@ -166,6 +165,7 @@ static void watch(Barrier *t, Track *k, I moving, V slope, V full) {
 
 static void go_back(Barrier *t, Track *k, I of) {
     keep(t, of, 1);
+    values(t, t->live, t->lanes.X, t->lanes.U, t->c, t->gap);
     for (int l = 0; l < LANES; l++) if (LANE(of, l)) LANE(k->watching, l) = k->shortened[l] = 0;
 }
 

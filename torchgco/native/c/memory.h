@@ -5,7 +5,7 @@
 static int64_t length(const Array *a, int64_t knots) { return a->data ? (a->knot ? knots : 1) * a->size : 0; }
 
 static void fill(OUT to, const Array *from, int64_t knots, int lane, int64_t element) {
-    if (!from->data) return;
+    if (!from->data || ADDRESS(to) == from->data) return;
     const double *source = from->data + element * from->element;
     int64_t count = from->knot ? knots : 1;
     for (int64_t k = 0; k < count; k++)
@@ -28,27 +28,36 @@ static Numbers cut(Cut *from, int64_t count) {
     return part;
 }
 
+/* Numbers that whoever calls has: of a single problem, an exported solver has them there alone. */
+static Numbers cut_at(Cut *from, const Problem *p, const double *data, int64_t count) {
+    return p->arena && data ? IN_PLACE(data) : cut(from, count);
+}
+
+static Numbers cut_array(Cut *from, const Problem *p, const Array *a, int64_t knots) {
+    return cut_at(from, p, a->data, length(a, knots));
+}
+
 static int64_t lay_out(Lanes *s, Numbers memory) {
     const Problem *p = s->of;
     int64_t N = p->N;
     Cut m = {memory, 0};
-    s->X = cut(&m, (N + 1) * NX); s->U = cut(&m, N * NU); s->Xn = cut(&m, (N + 1) * NX); s->Un = cut(&m, N * NU);
-    s->G = cut(&m, N * NU * NZ);
-    s->parameters = cut(&m, length(&p->parameters, N));
-    for (int i = 0; i < COST_ARRAYS; i++) s->cost_data[i] = cut(&m, length(p->cost_data + i, N));
-    s->center = cut(&m, length(&p->center, N + 1)); s->radius = cut(&m, length(&p->radius, N + 1));
+    s->X = cut_at(&m, p, p->X, (N + 1) * NX); s->U = cut_at(&m, p, p->U, N * NU);
+    if (!s->of_barrier) { s->Xn = cut(&m, (N + 1) * NX); s->Un = cut(&m, N * NU); }
+    s->G = cut_at(&m, p, p->gains, N * NU * NZ);
+    s->parameters = cut_array(&m, p, &p->parameters, N);
+    for (int i = 0; i < COST_ARRAYS; i++) s->cost_data[i] = cut_array(&m, p, p->cost_data + i, N);
+    s->center = cut_array(&m, p, &p->center, N + 1); s->radius = cut_array(&m, p, &p->radius, N + 1);
     for (int64_t i = 0; i < p->constraints; i++) {
         const Constraint *c = p->constraint + i;
         Rows rows = {0};
-        rows.lam = cut(&m, c->knots * c->rows); rows.bound = cut(&m, length(&c->bound, c->knots));
-        rows.squares = cut(&m, length(&c->squares, 1)); rows.velocities = cut(&m, length(&c->velocities, 1));
-        rows.stops = cut(&m, length(&c->stops, 1)); rows.radii = cut(&m, length(&c->radii, c->knots));
-        rows.lift = cut(&m, length(&c->lift, c->knots));
+        if (!s->of_barrier) { rows.lam = cut(&m, c->knots * c->rows); rows.pushed = (Truths)cut(&m, c->knots); }
+        rows.bound = cut_array(&m, p, &c->bound, c->knots); rows.squares = cut_array(&m, p, &c->squares, 1);
+        rows.velocities = cut_array(&m, p, &c->velocities, 1); rows.stops = cut_array(&m, p, &c->stops, 1);
+        rows.radii = cut_array(&m, p, &c->radii, c->knots); rows.lift = cut_array(&m, p, &c->lift, c->knots);
         if (c->balls > 0) {
             rows.widest = cut(&m, c->squares.size / c->balls);
             rows.near = (Places)cut(&m, c->rows / c->balls);
         }
-        rows.pushed = (Truths)cut(&m, c->knots);
         for (int l = 0; l < LANES; l++) rows.map[l] = c->map;
         if (memory) s->rows[i] = rows;
     }
@@ -57,15 +66,20 @@ static int64_t lay_out(Lanes *s, Numbers memory) {
 
 static void finish(Lanes *s) { give(s->of, s->rows); give(s->of, s->memory); }
 
-static int start(Lanes *s, const Problem *p) {
-    memset(s, 0, sizeof *s);
-    s->of = p;
+static int take_lanes(Lanes *s) {
+    const Problem *p = s->of;
     int64_t count = lay_out(s, 0);
     s->memory = take_numbers(p, count + 1);
     s->rows = (Rows *)take(p, (p->constraints + 1) * sizeof(Rows));
     if (!s->memory || !s->rows) { finish(s); return 0; }
     lay_out(s, s->memory);
     return 1;
+}
+
+static int start(Lanes *s, const Problem *p) {
+    memset(s, 0, sizeof *s);
+    s->of = p;
+    return take_lanes(s);
 }
 
 /* Find the largest radii of a body's spheres in a lane. */

@@ -34,7 +34,7 @@ TGCO_BETWEEN_UNITS void roll(Lanes *s, CALLABLE(Value) value, V alpha, V enough,
    (N, NX) is how far each step ends from the knot after it, NULL along a rollout. */
 TGCO_BETWEEN_UNITS void backward(Lanes *s, CALLABLE(Expand) expand, IN gap, V *linear, V *squares, V *lowest) {
     const Problem *p = s->of;
-    V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[NU * NU], Y[NU * NZ], pivots[NU];
+    V P[NX * NX], vector[NX], g[S], H[S * S], T[S * NX], f[NJ ? NJ : 1], L[TRIANGLE(NU)], Y[NU * NZ], pivots[NU];
     V sum = SET(0.0), square = SET(0.0), least = SET(INFINITY);
     int regular = any(s->mu_r > SET(0.0));
     memset(g, 0, sizeof g); memset(H, 0, sizeof H);

@@ -29,6 +29,7 @@ typedef struct {
     V weight, mu, inverse_mu, mu_r, merit, cost, inner, made, alpha, used;
     V floor; /* the constraints' terms add no less than minus this to L_M: lam^2 / (2 mu) for each row */
     int64_t element[LANES], rung[LANES]; /* at which the next line search begins */
+    int of_barrier; /* whose memory has room for trials and multipliers */
     Numbers memory;
 } Lanes;
 

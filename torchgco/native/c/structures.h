@@ -14,7 +14,9 @@ typedef struct {
     int32_t kind, equality, geometric, rows; /* rows of a knot */
     const int32_t *place; /* (N+1): index among the constraint's knots, or NOWHERE */
     int64_t knots;
-    double *lam, *best; /* (E, knots, rows): multipliers, NULL where all are 0; and those of an outer loop's best */
+    /* (E, knots, rows): multipliers, NULL where all are 0, of an exported solver one after the other; and those of an outer
+       loop's best */
+    double *lam, *best;
     const int32_t *variable; /* BOUNDS: (rows) index into [x, u] */
     const double *sign; /* BOUNDS: (rows) +1 for an upper bound, -1 for a lower one */
     /* BOUNDS (E, knots, rows); SPHERES: centres (E, 1, rows * DIM), or (E, knots, rows * DIM) where they are `moved`;

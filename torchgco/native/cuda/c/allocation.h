@@ -7,6 +7,8 @@ _Static_assert(sizeof(Rows) + 2 * sizeof(void *) <= ROWS, "Rows have more bytes 
 /* Of all threads: numbers of each, and bytes of all else. */
 typedef struct { V *numbers; char *others; int64_t count, bytes; } Arenas;
 
+#define IN_PLACE(data) NONE /* never: numbers of threads are interleaved */
+
 typedef struct { char *numbers, *others; int64_t count, bytes, used, taken; } Arena;
 __shared__ Arena tgco_arenas[THREADS];
 
