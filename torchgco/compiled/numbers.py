@@ -168,10 +168,9 @@ class KeptLifted(Kept):
         self._given, self._frees = user.x0.numpy(), user.time is not None
 
     def start(self) -> None:
-        """See `Kept`; the factor of time stays as it is."""
-        n, first = self._given.shape[1], self._moving[0][:, 0]
-        self._x0[:, :n] = first[:, :n] = self._given
-        first[:, n + self._frees :] = self._x0[:, n + self._frees :]
+        """See `Kept`; the factor of time is free, too."""
+        self._x0[:, : self._given.shape[1]] = self._given
+        super().start()
 
     def read(self, changed: set[str | int], now: Any) -> set[str | int]:
         """Put numbers of the user's parts that have changed where the form has copies of them.
