@@ -60,8 +60,8 @@ def follower(**more: Any) -> Problem:
 TIMES: dict[str, Callable[[], Problem]] = {
     "a goal": timed,
     "discs": lambda: timed(Spheres([[0.5, 0.3]], [0.3], 0.1)),
-    "boxes": lambda: timed(Boxes([[0.5, 0.3]], [[0.3, 0.2]], 0.1)),
-    "capsules": lambda: timed(Capsules([[0.5, -0.6]], [[0.6, 0.2]], [0.15], 0.1)),
+    "boxes": lambda: timed(Boxes([[0.5, 0.55]], [[0.2, 0.1]], 0.15)),
+    "capsules": lambda: timed(Capsules([[0.5, -0.8]], [[0.6, -0.2]], [0.15], 0.15)),
     "ellipsoids": lambda: timed(Ellipsoids([[0.5, 0.3]], [[0.4, 0.2]], 0.1)),
     "a map": lambda: timed(Field(grid(), 0.1)),
     "moving discs": lambda: timed(Spheres([[0.5, 0.9]], [0.3], 0.1, velocities=[[0.0, -0.3]])),
@@ -69,7 +69,7 @@ TIMES: dict[str, Callable[[], Problem]] = {
     "cones": lambda: timed(Cone([1.0, 0.0, 0.0], 1.2, ("x", [3, 4, 5])), d=3),
     "a function": lambda: timed(FunctionConstraint(lambda x, u: x[..., 2:3] + 0.2 * u[..., :1] - 1.4, of="xu")),
     "segments": lambda: timed(StateBounds(-np.inf, [np.inf, np.inf, 1.2, np.inf], knots=[5, 6, 7]), segments=2),
-    "three segments": lambda: timed(Spheres([[0.5, 0.3]], [0.3], 0.1), segments=[3, 8]),
+    "three segments": lambda: timed(Spheres([[0.5, 0.5]], [0.3], 0.1), segments=[3, 8]),
     "a path": follower,
     "a free start": lambda: timed(free_start=[False, False, False, True]),
 }

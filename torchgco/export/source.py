@@ -258,11 +258,12 @@ def _bound(
 ) -> str:
     """The function `bind`, which fills the structures that the solver reads."""
     lines = [
+        UNKNOWN,
         SQUARES if any(copies.squares for copies in changing.copied.values()) else "",
         LIMITED if any(copies.bounds for copies in changing.copied.values()) else "",
         "static void bind(NAME_workspace *w, Solve *b) {",
         "    const double *numbers = (const double *)(const void *)&w->numbers;",
-        "    const int element = ELEMENT(w);",
+        "    const int element = unknown(ELEMENT(w));",
         "    const double *exported = (const double *)(const void *)(exported_numbers + element);",
         "    (void)numbers; (void)exported; (void)element;",
         "    memset(b, 0, sizeof *b);",
@@ -284,6 +285,13 @@ def _bound(
     return "\n".join(line for line in lines if line)
 
 
+UNKNOWN = """
+/* A value that no compiler knows: gcc 12.2 with AVX-512 copies small constant arrays {5, 5, 0, 0} as {5, 5, 5, 5}. */
+static int unknown(int value) {
+    volatile int kept = value;
+    return kept;
+}
+"""
 SQUARES = """
 /* The square of a radius and the vehicle's, of which one may change; what was exported stays to the last bit. */
 static void fill_square(double *square, const double *numbers, const double *exported, const int32_t *source,

@@ -522,7 +522,8 @@ void NAME_reset(NAME_workspace *w) {
 void NAME_init(NAME_workspace *w@OF_ELEMENT@) {
     memset(w, 0, sizeof *w);
 @OWN@
-    memcpy(&w->numbers, exported_numbers + ELEMENT(w), sizeof w->numbers);
+    int e = unknown(ELEMENT(w));
+    memcpy(&w->numbers, exported_numbers + e, sizeof w->numbers);
     NAME_reset(w);
 }
 
