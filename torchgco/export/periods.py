@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from torchgco.export.files import Exported
 
 PERIODS = 40  # of each element
-NEAR = 1e-3  # of the range of controls along the test, that those in single precision may differ from Python's
+NEAR = 1e-3  # of the range of controls along the test's plans, that those in single precision may differ from Python's
+LEAST = 1e-6  # of their size, where they hardly change: some last bits of single precision
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
 FLOWN = 0.6  # of the time of the first plan, that the test lasts at most where the time is free
 
@@ -30,9 +31,11 @@ class Periods:
 
     Attributes:
         elapsed: s, between two steps where the time is free.
+        ranges: by how much controls change along the plans, (m,), and how large they are.
     """
 
     elapsed: float
+    ranges: tuple[np.ndarray, np.ndarray] | None = None
     states: list[np.ndarray] = field(default_factory=list)
     controls: list[np.ndarray] = field(default_factory=list)
     iterations: list[int] = field(default_factory=list)
@@ -54,7 +57,7 @@ def periods_of(exported: Exported) -> Periods:
         elapsed = min(elapsed, FLOWN * float(begin.plan[2][:, -1].min()) / PERIODS)
     each, runs = [Periods(elapsed) for _ in range(B)], np.full(B, not free or begin.plan is not None)
     x, draws = compiled.problem.x0.numpy().copy(), np.random.default_rng(0)
-    first = x
+    first, plans = x, list[np.ndarray]()
     for k in range(PERIODS):
         answer = _stepped(compiled, exported, x, elapsed if k else 0.0, k == 0)
         runs &= answer.status.numpy() == Status.CONVERGED
@@ -63,6 +66,7 @@ def periods_of(exported: Exported) -> Periods:
         if not runs.any():
             break
         u = _controls(compiled, exported, answer)
+        plans.append(answer.U[torch.from_numpy(runs)].flatten(0, 1).numpy())
         for b in runs.nonzero()[0].tolist():
             each[b].states.append(x[b])
             each[b].controls.append(u[b].numpy())
@@ -70,7 +74,8 @@ def periods_of(exported: Exported) -> Periods:
             each[b].elements.append(b)
         later = first if not exported.receding else _states_at(answer, elapsed) if free else answer.X[:, 1].numpy()
         x = later + DISTURBED * answer.X.abs().amax(1).numpy() * draws.standard_normal(x.shape)
-    every = Periods(elapsed)
+    U = np.concatenate(plans) if plans else np.zeros((1, exported.problem.m))
+    every = Periods(elapsed, (np.ptp(U, axis=0), np.abs(U).max(axis=0)))
     for one in each:
         for name in ("states", "controls", "iterations", "elements"):
             getattr(every, name).extend(getattr(one, name))
@@ -119,7 +124,8 @@ def compared(exported: Exported, periods: Periods) -> dict[str, str]:
     """What the test compares with, and how: in double precision all bits."""
     flat = lambda rows: [float(value) for row in rows for value in row] or [0.0]
     is_double, many = exported.number == 8, exported.problem.B > 1
-    near = NEAR * np.ptp(np.array(periods.controls or [np.zeros(exported.problem.m)]), axis=0)
+    assert periods.ranges is not None
+    near = np.maximum(NEAR * periods.ranges[0], LEAST * periods.ranges[1])
     tables = [
         table("static const double states[]", flat(periods.states)),
         table("static const double controls[]", flat(periods.controls)),

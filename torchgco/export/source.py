@@ -28,7 +28,8 @@ from torchgco.native.packing import kind_of
 from torchgco.problem.problem import Problem
 from torchgco.receding.plan import KNOT_ROUNDING, STAGE_ROUNDING
 from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import SADDLE_STEPS, InteriorPoint
+from torchgco.solvers.interior import FEW, ROUGH, SADDLE_STEPS, InteriorPoint
+from torchgco.solvers.timing import HELD_FIRST
 
 HERE = Path(__file__).parent / "c"
 TYPES = {
@@ -197,7 +198,7 @@ def _solve_numbers(problem: Problem, begin: Beginning) -> int:
     """How many numbers the arrays of the structure Solve have, but for those that are made."""
     N, n, m = problem.N, problem.n, problem.m
     stage = (n + m) * (n + m) + (n + m) * n + m * n
-    return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1) + begin.segments
+    return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1) + (begin.segments + n if begin.segments else 0)
 
 
 def _places(kept: Kept, changing: Changing, multipliers: dict[int, int]) -> dict[int, str]:
@@ -275,7 +276,8 @@ def _bound(
         "    b->follow.gains = b->gains;",
         f"    b->rest = {rest};",
         "    b->contact_depth = contact_depth + element * " + str(max(1, len(rows))) + ";",
-        "    b->first_factor = first_factor + element * SEGMENTS;" if begin.segments else "",
+        "    b->most = MAX_SOLVE_ITERATIONS;",
+        *(FREE_TIME if begin.segments else []),
         "    b->arena_begin = (unsigned char *)(b + 1);",
         "    b->arena.next = b->arena_begin;",
         "    b->arena.end = (unsigned char *)w->room + sizeof w->room;",
@@ -285,6 +287,11 @@ def _bound(
     return "\n".join(line for line in lines if line)
 
 
+FREE_TIME = (
+    "    b->first_factor = first_factor + element * SEGMENTS;",
+    "    memcpy(b->free_start, b->how.free_start, sizeof b->free_start);",
+    "    b->how.free_start = b->free_start; /* that of the time may be held */",
+)
 UNKNOWN = """
 /* A value that no compiler knows: gcc 12.2 with AVX-512 copies small constant arrays {5, 5, 0, 0} as {5, 5, 5, 5}. */
 static int unknown(int value) {
@@ -334,7 +341,8 @@ def _sizes(B: int, begin: Beginning, count: int, multipliers: dict[int, int]) ->
     words = of_many if B > 1 else {"ELEMENT(w)": 0, "HAS_ELEMENT(w)": 1}
     values: dict[str, Any] = {"SEGMENTS": begin.segments, "HAS_PLAN": int(begin.plan is not None)}
     if begin.segments:
-        values |= {"STAGE": begin.stage, "USER_CONSTRAINTS": begin.constraints, "KNOT_ROUNDING": KNOT_ROUNDING}
+        values |= {"STAGE": begin.stage, "USER_CONSTRAINTS": begin.constraints, "KNOT_ROUNDING": KNOT_ROUNDING,
+            "LONGER": HELD_FIRST, "FEW": FEW, "ROUGH": ROUGH}
         values |= {"ROOM_NUMBERS": count, "MOST_MULTIPLIERS": max(multipliers.values())}
     return defines(words | values) + "enum { N = NAME_N, USER_NX = NAME_NX, USER_NU = NAME_NU };"
 
@@ -376,9 +384,10 @@ def _structure(K: int, made: list[str], begin: Beginning) -> str:
             "    const double *contact_depth; /* of each constraint */",
             *(["    const double *first_factor; /* (SEGMENTS) */"] if begin.segments else []),
             *(["    double factor[SEGMENTS]; /* with which a solve from rest begins */"] if begin.segments else []),
+            *(["    double free_start[NX];"] if begin.segments else []),
             "    double mu, error, theta, falls, cost;",
             "    int64_t iterations;",
-            "    int32_t status;",
+            "    int32_t status, most; /* most: iterations of a solve */",
             "    double X[(N + 1) * NX], U[N * NU], gains[N * NU * NZ], beside[N * NU];",
             *made,
             "} Solve;",

@@ -183,9 +183,9 @@ static const How FROM_REST = {COLD_MU, COLD_PUSH, 0, 1};
 /* One solve from the iterate w->x, w->u and its multipliers, in place: b->X, b->U is the rollout that it stands for, and
    w->violation its. Returns whether it is a solution. */
 static int run(NAME_workspace *w, Solve *b, How how, double until) {
-    int left = w->max_iterations > 0 ? w->max_iterations - w->iterations : MAX_SOLVE_ITERATIONS;
+    int left = w->max_iterations > 0 ? w->max_iterations - w->iterations : b->most;
     double cost;
-    b->how.max_iter = left < MAX_SOLVE_ITERATIONS ? left : MAX_SOLVE_ITERATIONS;
+    b->how.max_iter = left < b->most ? left : b->most;
     b->how.seconds = until - seconds_of(&b->arena);
     b->how.bound_push = how.push; b->how.warm = how.warm; b->how.minimum = how.minimum;
     b->mu = how.mu; b->iterations = 0; b->status = RUNNING; b->falls = 0;
@@ -388,13 +388,40 @@ static int from_rest_once(NAME_workspace *w, Solve *b, const double *x, double u
     return (fits || w->violation <= ADMITTED) && CONSTRAINED ? FEASIBLE : status;
 }
 
-/* The same; where the time is free, again with twice the time where nothing is found. */
+#if SEGMENTS
+/* At the time that the solve begins with, roughly; then it is free. Freed at once it may shrink until no trajectory is
+   left. Returns the status of what is found, in b->X and b->U. */
+static int from_held_time(NAME_workspace *w, Solve *b, const double *x, double until) {
+    for (int again = 0; again < 2; again++) {
+        double tolerance = b->how.tol;
+        rest(w, b, x);
+        b->free_start[USER_NX] = 0; b->how.tol = ROUGH; b->most = FEW;
+        cold(w, b, x, until);
+        b->free_start[USER_NX] = 1; b->how.tol = tolerance; b->most = MAX_SOLVE_ITERATIONS;
+        if (!(w->violation <= VIOLATION) || !is_finite_rollout(b)) return b->status == CONVERGED ? MAX_ITERATIONS : b->status;
+        if (again) return FEASIBLE; /* for this time alone */
+        memcpy(w->x, b->X, sizeof w->x); memcpy(w->u, b->U, sizeof w->u);
+        if (cold(w, b, x, until)) return CONVERGED;
+    }
+    return b->status;
+}
+#endif
+
+/* The same; where the time is free and nothing is found, with the time held at first, and with twice the time. */
 static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until) {
 #if SEGMENTS
-    for (int s = 0; s < SEGMENTS; s++) b->factor[s] = within_factors(b, s, b->first_factor[s]);
+    double left[SEGMENTS];
+    if (w->age >= 0) factors_left(w, b, left);
+    for (int s = 0; s < SEGMENTS; s++)
+        b->factor[s] = within_factors(b, s, w->age >= 0 ? LONGER * left[s] : b->first_factor[s]);
     for (;;) {
-        int longer = 0, status = from_rest_once(w, b, x, until);
-        if (status == CONVERGED || status == FEASIBLE || status == INVALID_START || is_over(w, b, until)) return status;
+        int longer = 0, status;
+        b->most = FEW;
+        status = from_rest_once(w, b, x, until);
+        b->most = MAX_SOLVE_ITERATIONS;
+        if (status == CONVERGED || status == INVALID_START || is_over(w, b, until)) return status;
+        status = from_held_time(w, b, x, until);
+        if (status == CONVERGED || status == FEASIBLE || is_over(w, b, until)) return status;
         for (int s = 0; s < SEGMENTS; s++) {
             double twice = within_factors(b, s, 2 * b->factor[s]);
             longer |= twice > b->factor[s];
@@ -412,10 +439,7 @@ static void plan_before(NAME_workspace *w, Solve *b) {
     memset(b->gains, 0, sizeof b->gains);
 #if SEGMENTS
     double factor[SEGMENTS];
-    for (int s = 0; s < SEGMENTS; s++) {
-        int first = first_stage[s], last = first_stage[s + 1];
-        factor[s] = (w->t[last] - w->t[first]) / (STAGE * (last - first));
-    }
+    factors_of(b, w->t, factor);
     lift(w->X, w->U, factor, w->x, w->u);
     b->arena.next = b->arena_begin;
     Left left = left_of(b, factor, w->age);

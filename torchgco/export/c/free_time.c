@@ -96,6 +96,15 @@ static Left left_of(Solve *b, const double *factor, double seconds) {
     return left;
 }
 
+/* The factors of what is left of the plan that is flown. */
+static void factors_left(const NAME_workspace *w, Solve *b, double *left) {
+    double factor[SEGMENTS];
+    factors_of(b, w->t, factor);
+    b->arena.next = b->arena_begin;
+    Left now = left_of(b, factor, w->age);
+    memcpy(left, now.factor, sizeof factor);
+}
+
 /* Number i of `width` at a place among `count` knots, on the straight line between two. */
 static double between(const double *values, int count, int width, int i, double place) {
     int k = (int)place, last = count > 1 ? count - 2 : 0;
