@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tests.export.kinds import N, car_rates, point
+from tests.export.kinds import N, car_rates
 from torchgco import (
     Boxes,
     Capsules,
@@ -39,8 +39,8 @@ def timed(*parts: Any, d: int = 2, x0: Any = None, most: float = 4.0, segments: 
     cost = QuadraticCost([0.0] * 2 * d, [0.02] * d, [0.0] * 2 * d)
     goal = Goal(state=[2.0, 0.3, 0.2][:d] + [0.0] * d, required=True)
     more = {"goal": goal, "time": FreeTime(0.2, most, 1.0, segments=segments)} | more
-    x0 = [-1.0, 0.0, 0.0][:d] + [0.0] * d if x0 is None else x0
-    return Problem(model, cost, [ControlBounds(-2.0, 2.0), *parts], x0, N, **more)
+    start: Any = [-1.0, 0.0, 0.0][:d] + [0.0] * d if x0 is None else x0
+    return Problem(model, cost, [ControlBounds(-2.0, 2.0), *parts], start, N, **more)
 
 
 def grid() -> OccupancyGrid:
@@ -54,7 +54,8 @@ def follower(**more: Any) -> Problem:
     path = np.stack((np.linspace(0, 6, N + 1), 0.5 * np.sin(np.linspace(0, 3, N + 1)), *np.zeros((2, N + 1))), -1)
     cost = QuadraticCost([1.0, 1, 0, 0], [0.05, 0.5], [5.0, 5, 0, 0], path)
     bounds = [ControlBounds([-3.0, -0.5], [3.0, 0.5]), StateBounds(-np.inf, [np.inf, np.inf, np.inf, 4.0])]
-    return Problem(SWEPT, cost, bounds, [0.0, 0.0, 0.0, 2.0], N, time=FreeTime(0.4, 2.0, 1.0), **more)
+    start: Any = [0.0, 0.0, 0.0, 2.0]
+    return Problem(SWEPT, cost, bounds, start, N, time=FreeTime(0.4, 2.0, 0.1), **more)
 
 
 TIMES: dict[str, Callable[[], Problem]] = {
@@ -69,7 +70,7 @@ TIMES: dict[str, Callable[[], Problem]] = {
     "cones": lambda: timed(Cone([1.0, 0.0, 0.0], 1.2, ("x", [3, 4, 5])), d=3),
     "a function": lambda: timed(FunctionConstraint(lambda x, u: x[..., 2:3] + 0.2 * u[..., :1] - 1.4, of="xu")),
     "segments": lambda: timed(StateBounds(-np.inf, [np.inf, np.inf, 1.2, np.inf], knots=[5, 6, 7]), segments=2),
-    "three segments": lambda: timed(Spheres([[0.5, 0.5]], [0.3], 0.1), segments=[3, 8]),
+    "three segments": lambda: timed(StateBounds(-np.inf, [np.inf, np.inf, 1.3, np.inf]), segments=[3, 8]),
     "a path": follower,
     "a free start": lambda: timed(free_start=[False, False, False, True]),
 }

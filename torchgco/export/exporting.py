@@ -14,7 +14,8 @@ from torchgco.compiled import Compiled, compile
 from torchgco.compiled.motion import Motion
 from torchgco.constraints.gates import has_gates
 from torchgco.export.beginning import beginning
-from torchgco.export.files import Build, Exported, write_files
+from torchgco.export.exported import Exported
+from torchgco.export.files import Build, write_files
 from torchgco.export.numbers import changing
 from torchgco.export.source import solver_source
 from torchgco.kernels import current, interior_of, served_by
@@ -82,8 +83,8 @@ def export_c(
         compiled = _compiled_again(problem)
     else:
         compiled = compile(_checked(problem), "interior_point")
-    kept, problem = _served(compiled, receding), compiled.problem
-    places = Motion(problem).places if receding else []
+    kept = _served(compiled, receding)
+    places = Motion(compiled.problem).places if receding else []
     if changes is not None:
         changes = list(dict.fromkeys(compiled.numbers.find(name).name for name in [*changes, *places]))
     some = changing(kept, compiled, changes)

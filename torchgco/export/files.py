@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,16 +9,13 @@ import torch
 
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
-from torchgco.compiled import Compiled
 from torchgco.dynamics.names import controls_of, states_of
-from torchgco.export.beginning import Beginning
-from torchgco.export.numbers import Changing, Member
+from torchgco.export.exported import Exported
+from torchgco.export.numbers import Member
+from torchgco.export.periods import compared, periods_of
 from torchgco.export.single import single
-from torchgco.export.periods import NEAR, compared, periods_of
-from torchgco.export.source import HERE, Solver, replaced
+from torchgco.export.source import HERE, replaced
 from torchgco.native.codegen.emit import literal
-from torchgco.native.interior import Kept
-from torchgco.problem.problem import Problem
 
 EXAMPLE = 20  # periods of the example
 STACK = 4096  # bytes of a step, at most, on a Cortex-M: matrices lie in the workspace. tests/export/test_stack.py
@@ -50,7 +46,7 @@ FIXED = {
 }  # fmt: skip
 FREE = {
     "DEFINED": "PERIOD @PERIOD@ /* s: what `period` begins with */",
-    "PERIOD_FIELD": "    double period; /* s, until the next step: u is the plan's mean over it; 0: that of its first stage */\n",
+    "PERIOD_FIELD": "    double period; /* s: u is the plan's mean over it; 0: that of its first stage */\n",
     "TIMES_FIELD": "    double t[@KNOTS@]; /* times of the plan's knots, s: t[NAME_N] is how long it lasts */\n",
     "MOVES": "elapsed", "MOVED_BY": "The plan before is moved on by the seconds that have `elapsed`",
     "GUESS_TIMES": ", const double *t", "GUESS_NAMED": " at the times t (N+1) of its knots, s", "AGE": "seconds",
@@ -58,7 +54,8 @@ FREE = {
 ONE = {"ELEMENTS": "", "ELEMENT_FIELD": "", "OF_ELEMENT": "", "THAT": ""}
 SEVERAL = {
     "ELEMENTS": "#define NAME_ELEMENTS @B@ /* problems of this form; a workspace is of one of them */\n",
-    "ELEMENT_FIELD": "    int element; /* whose constants these are: NAME_init sets it */\n", "OF_ELEMENT": ", int element",
+    "ELEMENT_FIELD": "    int element; /* whose constants these are: NAME_init sets it */\n",
+    "OF_ELEMENT": ", int element",
     "THAT": " of an element, from 0 to NAME_ELEMENTS - 1; of\n   any other, steps return NAME_BAD_NUMBER",
 }  # fmt: skip
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
@@ -86,69 +83,6 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 #endif
 """
 NEEDS = "typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];\n"
-
-
-@dataclass(frozen=True)
-class Exported:
-    """What is written."""
-
-    compiled: Compiled
-    kept: Kept
-    solver: Solver
-    changing: Changing
-    begin: Beginning
-    name: str
-    receding: bool
-    number: int  # bytes of a number: 8 or 4
-
-    @property
-    def problem(self) -> Problem:
-        """The user's."""
-        return self.compiled.problem
-
-    @property
-    def is_free(self) -> bool:
-        """Whether the time is."""
-        return self.begin.time is not None
-
-    @property
-    def title(self) -> str:
-        p, free = self.problem, ", a free time" if self.is_free else ""
-        many = f", {p.B} elements" if p.B > 1 else ""
-        return f"{p.n} states, {p.m} controls, {p.N} stages{free}{many}"
-
-    @property
-    def stage(self) -> str:
-        """The length of a stage, s."""
-        return f"{float(torch.as_tensor(self.problem.dynamics.dt).flatten()[0]):g}"
-
-    @property
-    def period(self) -> float:
-        """By how much the horizon moves from step to step: stages, or seconds where the time is free."""
-        return float(self.receding) * (float(self.stage) if self.is_free else 1.0)
-
-    @property
-    def words(self) -> dict[str, Any]:
-        """What files say of its numbers."""
-        near = f"controls within {NEAR:g} of their range"
-        same, real = ("the same bits, status and iterations", "doubles") if self.number == 8 else (near, "floats")
-        many, free = self.problem.B > 1, self.is_free
-        return {
-            "SAME": same, "REAL": real, "FIRST": ", 0" if many else "",
-            "MOVED": "workspace.t[1]" if free else "NAME_STAGES",
-        }  # fmt: skip
-
-    @property
-    def sizes(self) -> tuple[int, int, int]:
-        """Numbers of X, U and K."""
-        p = self.problem
-        return (p.N + 1) * p.n, p.N * p.m, p.N * p.m * p.n
-
-    @property
-    def sizes_of_iterate(self) -> tuple[int, int]:
-        """Numbers of the solver's states and controls."""
-        p = self.kept.problem
-        return (p.N + 1) * p.n, p.N * p.m
 
 
 def write_files(exported: Exported, folder: Path, build: Build) -> Path:
@@ -198,7 +132,8 @@ def _header(exported: Exported) -> str:
     shapes = {"SIZE_X": X, "SIZE_U": U, "SIZE_K": K, "SIZE_x": x, "SIZE_u": u, "ROOM": exported.solver.room}
     words: dict[str, Any] = {
         **exported.words, **kind, **(SEVERAL if p.B > 1 else ONE), **shapes, "TITLE": exported.title,
-        "NX": p.n, "NU": p.m, "N": p.N, "KNOTS": p.N + 1, "B": p.B, "PERIOD": f"{exported.period!r}", "DT": exported.stage,
+        "NX": p.n, "NU": p.m, "N": p.N, "KNOTS": p.N + 1, "B": p.B, "DT": exported.stage,
+        "PERIOD": f"{exported.period!r}",
         "STATUSES": "\n".join(statuses), "NUMBERS": "\n".join(members) or "    double none; /* no number may change */",
         "MAX_ITERATIONS": exported.compiled.interior.max_iterations, "MULTIPLIERS": "\n".join(lam),
     }  # fmt: skip

@@ -163,8 +163,9 @@ def _probed(kept: Kept, compiled: Compiled, number: Number, first: int) -> dict[
         if len(tensor) != B or not bool((changed == changed[:1]).all()):
             return None
         at = changed[0].flatten().nonzero().flatten().tolist()
-        rows = [[there.get(value) for value in row] for there, row in zip(places, tensor.flatten(1)[:, at].tolist())]
-        if any(None in row for row in rows) or rows != rows[:1] * B:
+        pairs = zip(places, tensor.flatten(1)[:, at].tolist(), strict=True)
+        rows = [[there.get(value, -1) for value in row] for there, row in pairs]
+        if any(-1 in row for row in rows) or rows != rows[:1] * B:
             return None
         found[address] = Copies(at, [first + place for place in rows[0]], bounds=number.none is not None)
     return found or None

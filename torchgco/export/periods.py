@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,15 +11,12 @@ from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.compiled import Answer, Compiled, compile
+from torchgco.export.exported import NEAR, Exported
 from torchgco.export.tables import table
 from torchgco.problem.in_time import states_in_time
 from torchgco.receding.plan import Plan
 
-if TYPE_CHECKING:
-    from torchgco.export.files import Exported
-
 PERIODS = 40  # of each element
-NEAR = 1e-3  # of the range of controls along the test's plans, that those in single precision may differ from Python's
 LEAST = 1e-6  # of their size, where they hardly change: some last bits of single precision
 DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
 FLOWN = 0.6  # of the time of the first plan, that the test lasts at most where the time is free
@@ -83,7 +80,7 @@ def periods_of(exported: Exported) -> Periods:
 
 
 def _stepped(compiled: Compiled, exported: Exported, x: np.ndarray, elapsed: float, is_first: bool) -> Answer:
-    """A call from the states x (B, n); the first one begins with the plan that C begins with, where the time is free."""
+    """A call from the states x (B, n); where the time is free, the first one begins with the plan that C has."""
     if not exported.is_free:
         return compiled.call({"x0": x})  # type: ignore[no-any-return]
     plan, user = exported.begin.plan, compiled.problem

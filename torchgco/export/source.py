@@ -16,8 +16,8 @@ from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.constraints.bounds import LOOSE
 from torchgco.export.beginning import Beginning
 from torchgco.export.numbers import ABOVE_ZERO, AT_LEAST_ZERO, BOUND, Changing, Copies, fixed_radii
-from torchgco.export.tables import table
 from torchgco.export.single import VIOLATION, options_in_single
+from torchgco.export.tables import table
 from torchgco.lagrangian.barrier import FILTERED
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
@@ -151,14 +151,15 @@ def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, begin
     texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
+    parts = {"CONTACT": "contact.c", "FREE_TIME": "free_time.c" if begin.segments else None}
     text = (HERE / "controller.c").read_text()
-    if begin.time is not None:
-        text = text.replace("@FREE_TIME@", (HERE / "free_time.c").read_text())
+    for mark, file in parts.items():
+        text = text.replace(f"@{mark}@\n", "" if file is None else (HERE / file).read_text())
     own = [
         _constants(interior, bool(K), number), _sizes(B, begin, count, multipliers), *writer.tables,
         *(part.tables for part in made), *begin.tables(), _numbers_table(changing, B), _depths(kept),
         _structure(K, [part.declared for part in made], begin),
-        _assertion(count, K), lines, _checks(changing), text.replace("@FREE_TIME@\n", ""),
+        _assertion(count, K), lines, _checks(changing), text,
     ]  # fmt: skip
     flash = writer.flash + number * sum(m.size * B for m in changing.members) + sum(part.flash for part in made)
     flash += number * begin.count
@@ -197,8 +198,8 @@ def _structures(K: int) -> int:
 def _solve_numbers(problem: Problem, begin: Beginning) -> int:
     """How many numbers the arrays of the structure Solve have, but for those that are made."""
     N, n, m = problem.N, problem.n, problem.m
-    stage = (n + m) * (n + m) + (n + m) * n + m * n
-    return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1) + (begin.segments + n if begin.segments else 0)
+    stage, free = (n + m) * (n + m) + (n + m) * n + m * n, begin.segments + n if begin.segments else 0
+    return (stage if stage > ON_STACK else 0) + (N + 1) * n + 2 * N * m + N * m * (n + 1) + free
 
 
 def _places(kept: Kept, changing: Changing, multipliers: dict[int, int]) -> dict[int, str]:
@@ -341,8 +342,14 @@ def _sizes(B: int, begin: Beginning, count: int, multipliers: dict[int, int]) ->
     words = of_many if B > 1 else {"ELEMENT(w)": 0, "HAS_ELEMENT(w)": 1}
     values: dict[str, Any] = {"SEGMENTS": begin.segments, "HAS_PLAN": int(begin.plan is not None)}
     if begin.segments:
-        values |= {"STAGE": begin.stage, "USER_CONSTRAINTS": begin.constraints, "KNOT_ROUNDING": KNOT_ROUNDING,
-            "LONGER": HELD_FIRST, "FEW": FEW, "ROUGH": ROUGH}
+        values |= {
+            "STAGE": begin.stage,
+            "USER_CONSTRAINTS": begin.constraints,
+            "KNOT_ROUNDING": KNOT_ROUNDING,
+            "LONGER": HELD_FIRST,
+            "FEW": FEW,
+            "ROUGH": ROUGH,
+        }
         values |= {"ROOM_NUMBERS": count, "MOST_MULTIPLIERS": max(multipliers.values())}
     return defines(words | values) + "enum { N = NAME_N, USER_NX = NAME_NX, USER_NU = NAME_NU };"
 
