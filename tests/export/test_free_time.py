@@ -1,4 +1,4 @@
-"""Exported C with a free time: the bits of `compile` and `MPC` from an iterate on, and what it does where they search."""
+"""Exported C with a free time: the bits of `compile` and `MPC` from an iterate on, and what it does beside a search."""
 
 from __future__ import annotations
 
@@ -102,16 +102,12 @@ def test_numbers_change_between_steps_as_in_python(folder: Path, seed: int) -> N
     assert set(shares) < set(c.numbers) and "weight" not in c.numbers
     for name, share in shares.items():
         new = c.numbers[name] * (1.0 + share * draws.uniform(-1.0, 1.0, c.numbers[name].shape))
-        answer, u = compiled(numbers={compiled.numbers.find(full(name)).name: new[None]}), np.zeros(2)
+        answer, u = compiled(numbers={name: new[None]}), np.zeros(2)
         c.numbers[name][...] = new
         c.workspace.period = 0.0
         c.raw_step(x, 0.0, np.inf, u)
         assert answer.statuses == [Status.CONVERGED] and np.array_equal(u, answer.u[0].numpy()), name
         assert torch.equal(c.times, answer.t[0]) and c.workspace.iterations == int(answer.iterations[0]), name
-
-
-def full(name: str) -> str:
-    return {"state": "constraints[2].state"}.get(name, name)
 
 
 @pytest.mark.parametrize("name", ["least", "most"])
@@ -152,9 +148,9 @@ def test_a_guess_of_a_wrong_time_does_no_harm(folder: Path, times: float) -> Non
     c, problem = load_c(folder), TIMES["discs"]()
     found = torchgco.solve(problem, solver="interior_point", verbose=False)
     assert found.times is not None
-    c.guess(found.X[0], found.U[0], times * np.arange(13.0))
-    c.step(problem.x0[0])
-    assert c.status == Status.CONVERGED and float(c.times[-1]) == pytest.approx(float(found.times[0, -1]), abs=1e-2)
+    c.guess(found.X[0], found.U[0], times * np.arange(1.0, 14.0))
+    c.step(problem.x0[0])  # perhaps past the other side of the disc
+    assert c.status == Status.CONVERGED and float(c.times[-1]) == pytest.approx(float(found.times[0, -1]), rel=0.01)
     with pytest.raises(InputError, match="times"):
         c.guess(found.X[0], found.U[0])
     c.guess(found.X[0], found.U[0], found.times[0])
@@ -188,19 +184,19 @@ def test_a_pushed_point_arrives_as_with_mpc(kind: str, push: float, tmp_path: Pa
     assert held == 0 and np.abs(x - y).max() < 1e-3 and np.abs(x - [2.0, 0.3, 0.0, 0.0]).max() < 2e-3
 
 
-def test_without_a_plan_it_finds_the_time_from_rest(folder: Path) -> None:
-    """From states that are far from the exported start, and from inside a disc, where there is no plan."""
-    c, problem = load_c(folder), TIMES["discs"]()
-    for x0 in ([-1.0, -0.8, 0.3, 0.0], [-0.5, 0.9, 0.0, -0.4], [1.5, -0.5, 0.0, 0.0]):
+def test_without_a_plan_it_finds_the_time_from_rest(folder: Path, tmp_path: Path) -> None:
+    """From states that are far from the exported start; from inside a disc there is no plan."""
+    c = load_c(exported(timed(), tmp_path))
+    for x0 in ([-1.0, -0.8, 0.3, 0.0], [-0.5, 0.9, 0.0, -0.4], [1.5, -0.5, 0.0, 0.0], [1.9, 0.3, 1.5, 0.0]):
         c.reset()
         c.workspace.able = 0
         c.step(x0)
-        other = torchgco.solve(timed(Spheres([[0.5, 0.3]], [0.3], 0.1), x0=x0), solver="interior_point", verbose=False)
-        assert other.times is not None and c.status == Status.CONVERGED
-        assert float(c.times[-1]) <= float(other.times[0, -1]) + 1e-4
-    c.reset()
+        found = torchgco.solve(timed(x0=x0), solver="interior_point", verbose=False)
+        assert found.times is not None and c.status == found.statuses[0] == Status.CONVERGED
+        assert float(c.times[-1]) == pytest.approx(float(found.times[0, -1]), abs=1e-5)
+    c = load_c(folder)
     c.step([0.5, 0.3, 0.0, 0.0])
-    assert c.status == Status.INVALID_START and c.held and problem.N == c.N
+    assert c.status == Status.INVALID_START and c.held
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -209,7 +205,8 @@ def test_a_bad_state_is_no_step(folder: Path, bad: float) -> None:
     assert c.raw_step(np.array([bad, 0, 0, 0]), 0.0, np.inf, u) == -1 and np.array_equal(u, [0.0, 0.0]) and c.held
     c.step(x)
     U = c.plan[1]
-    assert c.raw_step(np.array([0, bad, 0, 0]), 0.1, np.inf, u) == -1 and np.array_equal(u, U[0].numpy()) and c.held
+    assert c.raw_step(np.array([0, bad, 0, 0]), 0.1, np.inf, u) == -1 and c.held
+    np.testing.assert_allclose(u, U[0].numpy(), rtol=0, atol=1e-12)
     assert c.raw_step(x, -1.0, np.inf, u) == -1 and c.raw_step(x, bad, np.inf, u) == -1
     assert c.raw_step(x, 1e9, np.inf, u) == Status.CONVERGED, "long after the plan has ended"
 

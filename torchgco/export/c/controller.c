@@ -352,10 +352,12 @@ static int from_held_time(NAME_workspace *w, Solve *b, const double *x, double u
 /* The same; where the time is free and nothing is found, with the time held at first, and with twice the time. */
 static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until) {
 #if SEGMENTS
-    double left[SEGMENTS];
-    if (w->age >= 0) factors_left(w, b, left);
-    for (int s = 0; s < SEGMENTS; s++)
-        b->factor[s] = within_factors(b, s, w->age >= 0 ? LONGER * left[s] : b->first_factor[s]);
+    memcpy(b->factor, b->first_factor, sizeof b->factor);
+    if (w->age >= 0) {
+        factors_left(w, b, b->factor);
+        for (int s = 0; s < SEGMENTS; s++) b->factor[s] *= LONGER;
+    }
+    for (int s = 0; s < SEGMENTS; s++) b->factor[s] = within_factors(b, s, b->factor[s]);
     for (;;) {
         int longer = 0, status;
         b->most = FEW;
@@ -523,7 +525,7 @@ int NAME_step(NAME_workspace *w, const double x[USER_NX], double moved, double m
         return w->status = status;
     }
     set_start(b, w->x, x);
-    if (w->able) {
+    if (w->able && !(guessed && starts_inside(b, x))) {
         w->warm = good = run(w, b, guessed ? FROM_GUESS : FROM_PLAN, until);
         status = good ? CONVERGED : b->status;
         late = status == TIME_LIMIT && is_finite_rollout(b);
