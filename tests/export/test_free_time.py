@@ -13,7 +13,7 @@ import torchgco
 from tests.export.exported import M7, SAME, STRICT, exported, needs, needs_compiler, on_board, said
 from tests.export.free import TIMES, timed
 from tests.slow import mostly
-from torchgco import InputError, Integral, LoadedController, RateBounds, Spheres, Status, load_c
+from torchgco import InputError, Integral, LoadedController, RateBounds, Status, load_c
 
 pytestmark = [
     needs_compiler,
@@ -122,6 +122,21 @@ def test_bounds_of_time_that_cross_are_refused(folder: Path, name: str) -> None:
         c.numbers[name][...] = before
     c.step(x)
     assert c.status == Status.CONVERGED
+
+
+def test_numbers_are_the_same_at_all_stages(folder: Path) -> None:
+    """As in Python: what a stage's number is for, if stages have no times of their own, isn't known."""
+    c, x = load_c(folder), np.array([-1.0, 0.0, 0.0, 0.0])
+    c.numbers["u_ref"][:, 1] = 0.1
+    c.step(x)
+    assert c.status == Status.CONVERGED
+    c.numbers["u_ref"][4, 1] = 0.2
+    c.step(x)
+    assert c.workspace.status == -2 and c.held
+    c.numbers["u_ref"][4, 1] = 0.1
+    c.numbers["R"][...] = -1.0
+    c.step(x)
+    assert c.workspace.status == -2
 
 
 def test_a_late_step_flies_on_with_feedback(folder: Path) -> None:

@@ -17,6 +17,14 @@ from torchgco.problem.problem import Problem
 NEAR = 1e-3  # of the range of controls along the test's plans, that those in single precision may differ from Python's
 
 
+FIXED_NOTE = "- `stages` is by how many stages of {} s time has gone on since the last step; parts of one count, too."
+FREE_NOTE = """\
+- The third argument is the time since the last step, s. `w.t` has the times of the plan's knots, s, and u is the plan's
+  mean over `w.period`, s: set it to yours. The first step begins with a plan that was found when this was written."""
+ELEMENTS_NOTE = """\
+- There are {} elements: `NAME_init(&w, 0)` to `NAME_init(&w, {})` load the numbers of one of them."""
+
+
 @dataclass(frozen=True)
 class Exported:
     """What is written."""
@@ -62,9 +70,12 @@ class Exported:
         near = f"controls within {NEAR:g} of their range"
         same, real = ("the same bits, status and iterations", "doubles") if self.number == 8 else (near, "floats")
         many, free = self.problem.B > 1, self.is_free
+        elements = ELEMENTS_NOTE.format(self.problem.B, self.problem.B - 1)
         return {
             "SAME": same, "REAL": real, "FIRST": ", 0" if many else "",
-            "MOVED": "workspace.t[1]" if free else "NAME_STAGES",
+            "MOVED": "workspace.t[1]" if free else "NAME_STAGES", "USUAL": "NAME_PERIOD" if free else "NAME_STAGES",
+            "NOTES": "\n".join([FREE_NOTE if free else FIXED_NOTE.format(self.stage)] + [elements] * many),
+            "GUESSED": ", t" * free,
         }  # fmt: skip
 
     @property

@@ -42,7 +42,7 @@ FIXED = {
     "DEFINED": "STAGES @PERIOD@ /* by which the horizon moves from step to step, unless `stages` says otherwise */",
     "PERIOD_FIELD": "", "TIMES_FIELD": "", "MOVES": "stages",
     "MOVED_BY": "The plan before is moved on by so many stages", "GUESS_TIMES": "", "GUESS_NAMED": "",
-    "AGE": "stages",
+    "AGE": "stages", "NO_PLAN": "and there is no plan.",
 }  # fmt: skip
 FREE = {
     "DEFINED": "PERIOD @PERIOD@ /* s: what `period` begins with */",
@@ -50,13 +50,14 @@ FREE = {
     "TIMES_FIELD": "    double t[@KNOTS@]; /* times of the plan's knots, s: t[NAME_N] is how long it lasts */\n",
     "MOVES": "elapsed", "MOVED_BY": "The plan before is moved on by the seconds that have `elapsed`",
     "GUESS_TIMES": ", const double *t", "GUESS_NAMED": " at the times t (N+1) of its knots, s", "AGE": "seconds",
+    "NO_PLAN": "and the first step begins with\n   the plan that was found from the exported start.",
 }  # fmt: skip
 ONE = {"ELEMENTS": "", "ELEMENT_FIELD": "", "OF_ELEMENT": "", "THAT": ""}
 SEVERAL = {
     "ELEMENTS": "#define NAME_ELEMENTS @B@ /* problems of this form; a workspace is of one of them */\n",
     "ELEMENT_FIELD": "    int element; /* whose constants these are: NAME_init sets it */\n",
     "OF_ELEMENT": ", int element",
-    "THAT": " of an element, from 0 to NAME_ELEMENTS - 1; of\n   any other, steps return NAME_BAD_NUMBER",
+    "THAT": "\n   element: from 0 to NAME_ELEMENTS - 1; with another one all steps return NAME_BAD_NUMBER.",
 }  # fmt: skip
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
 #include "NAME.h"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from torchgco.base import numbers as checks
 from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number
 from torchgco.compiled import Compiled
-from torchgco.compiled.numbers import KeptInTime
+from torchgco.compiled.numbers import KeptInTime, steady
 from torchgco.native.interior import Kept
 from torchgco.native.structures import Array
 
@@ -44,6 +45,7 @@ class Member:
     shape: tuple[int, ...]
     values: np.ndarray
     kind: int
+    steady: int = 0  # how many numbers a stage has, of those that are the same at all stages; 0: others
 
     @property
     def size(self) -> int:
@@ -103,8 +105,11 @@ def changing(kept: Kept, compiled: Compiled, asked: Sequence[str] | None) -> Cha
             continue
         name = re.sub(r"\W+", "_", numbers.short(number.name)).strip("_")
         values = number.value.reshape(len(number.value), *(number.value.shape[1:] or (1,)))
-        kind = BOUND if number.none is not None else KINDS.get(number.check, FINITE)  # type: ignore[arg-type]
-        members.append(Member(name, number.name, first, values.shape[1:], values, kind))
+        check: Any = number.check
+        is_steady = isinstance(check, partial) and check.func is steady
+        kind = BOUND if number.none is not None else KINDS.get(check.args[-1] if is_steady else check, FINITE)
+        width = values[0, 0].size if is_steady and values.shape[1] > 1 else 0
+        members.append(Member(name, number.name, first, values.shape[1:], values, kind, width))
         shared |= ways[0]
         for address, own in ways[1].items():
             together = copied.setdefault(address, Copies(bounds=own.bounds))

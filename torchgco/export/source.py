@@ -410,10 +410,13 @@ def _assertion(count: int, K: int) -> str:
 def _checks(changing: Changing) -> str:
     """What is checked of the numbers."""
     spans = [f"{{{m.first}, {m.size}, {m.kind}}}" for m in changing.members] or ["{0, 0, 0}"]
+    steady = [f"{{{m.first}, {m.steady}}}" for m in changing.members if m.steady] or ["{0, 0}"]
     return "\n".join(
         [
             "/* Of numbers the first, how many, and whether they are finite, at least 0, above 0, or bounds. */",
-            f"static const struct {{ int first, count, kind; }} checks[] = {{{', '.join(spans)}}};\n",
+            f"static const struct {{ int first, count, kind; }} checks[] = {{{', '.join(spans)}}};",
+            "/* Those of a free time that are the same at all stages: the first, and how many a stage has. */",
+            f"static const struct {{ int first, width; }} steady[] = {{{', '.join(steady)}}};\n",
         ]
     )
 

@@ -87,6 +87,11 @@ static int has_bad_number(const NAME_workspace *w, const Solve *b) {
             if (numbers[j] != numbers[j] || (kind != BOUND && !is_finite_number)) return kind == BOUND ? 2 : 1;
             if ((kind == AT_LEAST_ZERO && numbers[j] < 0) || (kind == ABOVE_ZERO && numbers[j] <= 0)) return 1;
         }
+#if SEGMENTS
+    for (int i = 0; i < (int)(sizeof steady / sizeof *steady); i++)
+        for (int j = steady[i].width; j < N * steady[i].width; j++)
+            if (numbers[steady[i].first + j] != numbers[steady[i].first + j - steady[i].width]) return 1;
+#endif
     for (int64_t i = 0; i < b->problem.constraints; i++) {
         const Constraint *con = b->problem.constraint + i;
         if (!is_kind(con, BOUNDS)) continue;

@@ -45,7 +45,7 @@ typedef struct {
     double room[@ROOM@];
 } NAME_workspace;
 
-/* Makes a workspace ready: the numbers are those that were exported@THAT@, and there is no plan. */
+/* Makes a workspace ready: the numbers are those that were exported, @NO_PLAN@@THAT@ */
 void NAME_init(NAME_workspace *w@OF_ELEMENT@);
 
 /* Controls u for the next period from states x measured now. @MOVED_BY@,
