@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHGCO_CFLAGS", "-O1")
 
 
-def within(**more: object) -> Problem:
+def within(**more: Any) -> Problem:
     """A point whose height and speed at the start are free within bounds, beside a disc."""
     inf = np.inf
     first = StateBounds([-inf, -0.2, -2.0, -inf], [inf, 0.6, 2.0, inf], knots=[0])

@@ -55,7 +55,7 @@ def test_40_periods_have_the_bits_of_mpc(folder: Path, push: float) -> None:
     x, draws, warm = np.array([-1.0, 0.0, 0.0, 0.0]), np.random.default_rng(0), 0
     for k in range(40):
         v, u = mpc.step(x), c.step(x)
-        assert mpc.answer is not None and c.status == mpc.statuses[0] == Status.CONVERGED
+        assert mpc.answer is not None and mpc.answer.t is not None and c.status == mpc.statuses[0] == Status.CONVERGED
         if bool(mpc.answer.warm[0]):
             warm += 1
             assert torch.equal(u, v) and torch.equal(c.times, mpc.answer.t[0]), k
