@@ -214,6 +214,22 @@ def test_without_a_plan_it_finds_the_time_from_rest(folder: Path, tmp_path: Path
     assert c.status == Status.INVALID_START and c.held
 
 
+def test_a_goal_that_no_time_allows_is_held_at_rest(tmp_path: Path) -> None:
+    """There is no plan to begin with, and the folder's test has no periods; once there is time enough, it flies."""
+    folder = exported(timed(most=0.25), tmp_path)
+    assert "#define PERIODS 0" in (folder / "car_test.c").read_text()
+    c, x = load_c(folder), np.array([-1.0, 0.0, 0.0, 0.0])
+    for _ in range(2):
+        u = c.step(x)
+        assert (
+            c.held and c.status not in (Status.CONVERGED, Status.FEASIBLE) and torch.equal(u, torch.zeros(2).double())
+        )
+    c.step(x, most=[4.0])
+    assert c.status == Status.CONVERGED and not c.held
+    found = torchgco.solve(timed(), solver="interior_point", verbose=False)
+    assert found.times is not None and float(c.times[-1]) == pytest.approx(float(found.times[0, -1]), abs=1e-5)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_bad_state_is_no_step(folder: Path, bad: float) -> None:
     c, x, u = load_c(folder, period=0.0001), np.array([-1.0, 0.0, 0.0, 0.0]), np.zeros(2)

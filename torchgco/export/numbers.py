@@ -152,6 +152,8 @@ def _probed(kept: Kept, compiled: Compiled, number: Number, first: int) -> dict[
     element; None where they don't."""
     view, draws, part = number.views[0], np.random.default_rng(0), number.part
     old, probe = view.copy(), draws.uniform(1.0, 2.0, view.shape)
+    if part == "time":  # of which bounds don't cross
+        probe = old / probe if number.name.endswith(".least") else old * probe
     part = None if isinstance(kept, KeptInTime) else part  # lifted parts depend on several
     before = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, part)}
     try:
