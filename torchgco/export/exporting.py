@@ -49,16 +49,14 @@ def export_c(
     A step does what a step of `MPC` with `solver="interior_point"` does: it continues
     from the plan before, else begins again from what that leads to now, else from rest, and where all fail it holds the
     plan before with feedback. It doesn't search for other ways, nor for ways to come to rest, and obstacles that move
-    are where its numbers say that they are now. Where the time is free, steps are told the seconds that have elapsed,
-    and the first one begins with a plan that is sought here. Several problems are elements, of which a workspace is
-    given one.
+    are where its numbers say that they are now. In a free time the first step begins with a plan that is sought here.
+    Several problems are elements, of which a workspace is given one.
 
     Args:
         problem: B problems, or a compiled problem. Numbers of a GPU are copied.
         folder: is made if it isn't there; files of these names are overwritten.
         name: of files, types and functions: a word of C.
-        receding: each step's horizon begins a stage after that of the step before, or dt seconds where the time is
-            free; the example and the test move so.
+        receding: each step's horizon begins a stage, in a free time dt s, after that of the step before.
         changes: names of the numbers that steps may change, beside the places of obstacles that move where `receding`;
             the others are constants. None: all that C reads as they are or copies of.
         build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
