@@ -16,8 +16,8 @@ from tests.slow import mostly
 from torchgco import (
     Boxes,
     ControlBounds,
-    FreeTime,
     FunctionConstraint,
+    Gates,
     InputError,
     Link,
     OscillatingBoxes,
@@ -91,8 +91,9 @@ def test_only_chosen_numbers_change(tmp_path: Path) -> None:
 
 SWINGING = OscillatingBoxes(Boxes([[0.0, 0.6]], [[0.2, 0.1]], 0.1), [[[0.1, 0.2]]], [[[2.0, 1.0]]], [[[0.0, 0.5]]])
 REFUSED = {
-    "several vehicles": (lambda: point().take([0, 0]), {}, "one vehicle"),
-    "a free time": (lambda: point(time=FreeTime(least=0.5, most=2.0)), {}, "problem.time"),
+    "no element": (lambda: point().take([]), {}, "0 problems"),
+    "horizons": (lambda: point(horizon=[8]), {}, "problem.horizon"),
+    "gates in a loop": (lambda: point(Gates([[0.0, 0.1]], radius=0.3)), {}, "Gates"),
     "rates": (lambda: point(RateBounds(-1.0, 1.0)), {}, r"constraints\[1\].*RateBounds"),
     "a link": (lambda: point(Link(knots=(2, 5), components=[0])), {}, "Link"),
     "single precision": (lambda: Problem(point().dynamics, point().cost, [ControlBounds(-8.0, 8.0)],

@@ -70,3 +70,26 @@ def test_an_environment_ends_with_the_bits_of_python(folder: Path) -> None:
     own = acted(load_c(folder))
     other = acted(torchgco.MPC(problem(), "interior_point", max_seconds=float("inf")))
     assert all(map(torch.equal, own, other)) and float(own[-1][0, 0]) > 0.05
+
+
+def test_a_mission_of_several_vehicles_is_flown_by_elements(tmp_path: Path) -> None:
+    """Each by a workspace of its own, with the bits of an MPC of all."""
+    balls = torch.tensor([[[0.9, 0.15, 0.0]], [[0.8, -0.2, 0.1]]], dtype=torch.float64)
+    whole, logs = scene(balls, 0.2, N=10, goal=1.8), []
+    folder = exported(whole, tmp_path)
+    for exports in (True, False):
+        flight = Flight(mission(duration=0.5), whole, seed=3)
+        controllers = [load_c(folder, element=b) for b in range(2)] if exports else []
+        mpc = torchgco.MPC(whole, "interior_point", max_seconds=float("inf"))
+        while not flight.done:
+            measured = planning_state(flight.x, airframe_of(whole.dynamics))
+            if exports:
+                for c, x in zip(controllers, measured, strict=True):
+                    c.step(x)
+                flight.step(torch.stack([c.plan[0] for c in controllers]))
+            else:
+                mpc.step(measured)
+                flight.step(states(mpc))
+        logs.append(flight.log)
+    assert torch.equal(logs[0].x, logs[1].x) and torch.equal(logs[0].plan, logs[1].plan)
+    assert len(logs[0].x) == 2 and not torch.equal(logs[0].x[0], logs[0].x[1])

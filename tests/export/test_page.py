@@ -86,11 +86,20 @@ def test_the_command_writes_a_library_for_arduino(tmp_path: Path, capsys: pytest
     assert target / "src" / "boat.c" in files and f"boat.c, {size:.2f} MB" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_the_command_writes_layouts_as_elements(tmp_path: Path) -> None:
+    assert export.main([*WORDS, "--c", "boat", "--output", str(tmp_path / "boat"), "--layout", "1", "0"]) == 0
+    for element, layout in enumerate((1, 0)):
+        c, problem = load_c(tmp_path / "boat", element=element), planned(layout)
+        u = torchgco.compile(problem, "interior_point")(x0=problem.x0).u[0]
+        assert c.elements == 2 and torch.equal(c.step(problem.x0[0]), u)
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ((*WORDS, "--c", "2"), "word of C"),
-        ((*WORDS, "--c", "boat", "--layout", "0", "1"), "layout"),
+        ((*WORDS, "--c", "boat", "--layout", "0", "-1"), "layout"),
         ((*WORDS, "--c", "boat", "--rate", "10"), "--rate"),
         ((*WORDS, "--c", "boat", "--changes", "wind"), "wind"),
         (("nowhere", "--c", "boat"), "RUN"),

@@ -115,7 +115,7 @@ class Compiled:
             self._kept.begin_with(before)
 
     def _packed(self, problem: Any) -> None:
-        if problem.free_start is not None or problem.B == 0:
+        if problem.B == 0:
             return
         if problem.time is not None:
             self._kept = kept_in_time(problem, self.interior.options(warm=True))

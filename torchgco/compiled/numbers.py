@@ -168,10 +168,9 @@ class KeptLifted(Kept):
         self._given, self._frees = user.x0.numpy(), user.time is not None
 
     def start(self) -> None:
-        """See `Kept`; the factor of time stays as it is."""
-        n, first = self._given.shape[1], self._moving[0][:, 0]
-        self._x0[:, :n] = first[:, :n] = self._given
-        first[:, n + self._frees :] = self._x0[:, n + self._frees :]
+        """See `Kept`; the factor of time is free, too."""
+        self._x0[:, : self._given.shape[1]] = self._given
+        super().start()
 
     def read(self, changed: set[str | int], now: Any) -> set[str | int]:
         """Put numbers of the user's parts that have changed where the form has copies of them.
@@ -275,7 +274,7 @@ def _numbers_in_time(by_problem: list[Number], problem: Problem, where: str) -> 
     by_stage = problem.cost.names_by_stage()
     for number in by_problem:
         if number.part == f"{where}cost" and number.name.rpartition(".")[2] in by_stage:
-            number.check = partial(_steady, number, problem.N, number.check)
+            number.check = partial(steady, number, problem.N, number.check)
     tensors = {name: getattr(time, name) for name in ("least", "most", "weight", "guess")}
     fields = {
         name: (tensor, at_least_zero if name == "weight" else above_zero)
@@ -317,7 +316,7 @@ def overwrite(old: Any, new: Any) -> None:
             there.copy_(here)
 
 
-def _steady(number: Number, N: int, check: Any, new: Floats) -> Wrong:
+def steady(number: Number, N: int, check: Any, new: Floats) -> Wrong:
     """What is wrong with numbers by stage, which are the same at all stages where the time is free."""
     rows = np.moveaxis(new, new.ndim - len(number.shape) + 1, 0)[:N]
     if len(rows) > 1 and not (rows == rows[0]).all():

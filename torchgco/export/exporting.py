@@ -12,9 +12,10 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.compiled import Compiled, compile
 from torchgco.compiled.motion import Motion
-from torchgco.compiled.numbers import KeptInTime
-from torchgco.constraints.norms import within_norms
-from torchgco.export.files import Build, Exported, write_files
+from torchgco.constraints.gates import has_gates
+from torchgco.export.beginning import beginning
+from torchgco.export.exported import Exported
+from torchgco.export.files import Build, write_files
 from torchgco.export.numbers import changing
 from torchgco.export.source import solver_source
 from torchgco.kernels import current, interior_of, served_by
@@ -48,13 +49,14 @@ def export_c(
     A step does what a step of `MPC` with `solver="interior_point"` does: it continues
     from the plan before, else begins again from what that leads to now, else from rest, and where all fail it holds the
     plan before with feedback. It doesn't search for other ways, nor for ways to come to rest, and obstacles that move
-    are where its numbers say that they are now.
+    are where its numbers say that they are now. In a free time the first step begins with a plan that is sought here.
+    Several problems are elements, of which a workspace is given one.
 
     Args:
-        problem: one vehicle, or a compiled problem with one. Numbers of a GPU are copied.
+        problem: B problems, or a compiled problem. Numbers of a GPU are copied.
         folder: is made if it isn't there; files of these names are overwritten.
         name: of files, types and functions: a word of C.
-        receding: each step's horizon begins a stage after that of the step before; the example and the test move so.
+        receding: each step's horizon begins a stage, in a free time dt s, after that of the step before.
         changes: names of the numbers that steps may change, beside the places of obstacles that move where `receding`;
             the others are constants. None: all that C reads as they are or copies of.
         build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
@@ -66,10 +68,10 @@ def export_c(
         the folder.
 
     Raises:
-        InputError: a name that is no word of C, or a problem that C can't serve: several vehicles, a free time or
-            start, horizons, `RateBounds`, `Link` or `Integral`, a problem in single precision, code that can't be
-            compiled, where `receding` obstacles that move without numbers that say where they are; a number that can't
-            change; another dtype. No file is written then.
+        InputError: a name that is no word of C, or a problem that C can't serve: no element, horizons, `RateBounds`,
+            `Link` or `Integral`, a problem in single precision, code that can't be compiled, where `receding` gates,
+            and obstacles that move without numbers that say where they are; a number that can't change; another dtype.
+            No file is written then.
     """
     check_value(receding, bool, "receding")
     check_value(build, Build, "build")
@@ -82,18 +84,17 @@ def export_c(
         compiled = _compiled_again(problem)
     else:
         compiled = compile(_checked(problem), "interior_point")
-    kept = _served(compiled)
-    problem = kept.problem
-    places = Motion(problem).places if receding else []
+    kept = _served(compiled, receding)
+    places = Motion(compiled.problem).places if receding else []
     if changes is not None:
         changes = list(dict.fromkeys(compiled.numbers.find(name).name for name in [*changes, *places]))
-    some = changing(kept, compiled.numbers, changes)
+    some = changing(kept, compiled, changes)
     if lacking := sorted({*places} - {member.full for member in some.members}):
         raise InputError("problem", "obstacles whose places C reads as they are, where they move", lacking[0])
     with torch.no_grad():
-        rest = _guess_at_rest(problem)
-    solver = solver_source(kept, some, compiled.interior, rest, BYTES[dtype])
-    exported = Exported(compiled, kept, solver, some, name, receding, BYTES[dtype])
+        begin = beginning(compiled.now, kept.problem.m)
+    solver = solver_source(kept, some, compiled.interior, begin, BYTES[dtype])
+    exported = Exported(compiled, kept, solver, some, begin, name, receding, BYTES[dtype])
     return write_files(exported, Path(folder), build)
 
 
@@ -106,13 +107,12 @@ def _compiled_again(problem: Compiled) -> Compiled:
 def _checked(problem: Problem) -> Problem:
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem, or what torchgco.compile makes of one", type(problem).__name__)
-    if problem.B != 1:
-        raise InputError("problem", "one vehicle: export problem.take([b]) of each", f"{problem.B} problems")
+    if problem.B == 0:
+        raise InputError("problem", "one element or more", "0 problems")
     if problem.x0.dtype != torch.float64:
         raise InputError("problem.x0", "double precision", str(problem.x0.dtype))
-    for field, found in (("time", problem.time), ("free_start", problem.free_start), ("horizon", problem.horizon)):
-        if found is not None:
-            raise InputError(f"problem.{field}", "None in exported C", type(found).__name__)
+    if problem.horizon is not None:
+        raise InputError("problem.horizon", "None in exported C", type(problem.horizon).__name__)
     for i, part in enumerate(problem.constraints):
         if part.joins_knots:
             raise InputError(
@@ -121,18 +121,14 @@ def _checked(problem: Problem) -> Problem:
     return problem
 
 
-def _served(compiled: Compiled) -> Kept:
+def _served(compiled: Compiled, receding: bool) -> Kept:
     """The packed problem, or what keeps C from serving it."""
     problem = _checked(compiled.problem)
+    if receding and has_gates(problem):
+        raise InputError("problem", "one without Gates unless receding=False: a loop would put them off", "Gates")
     kept = compiled._kept
-    if kept is None or isinstance(kept, KeptInTime):
+    if kept is None:
         kernels = interior_of(current(for_solvers(problem)))  # raises, or warns, what is missing
         told = "code that reads a problem's numbers in Python" if isinstance(kernels, InteriorEngine) else "functions"
         raise InputError("problem", "functions that C compiles, of its numbers as tensors", told)
     return kept
-
-
-def _guess_at_rest(problem: Problem) -> torch.Tensor:
-    """Controls (N, m) at rest, within bounds of norms and cones, before those of single controls count."""
-    rest = problem.cost.rest_controls(problem.x0.new_zeros(1, problem.N, problem.m))
-    return within_norms(rest, problem.constraints)[0].contiguous()

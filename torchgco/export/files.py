@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
 from torchgco.base.status import Status
 from torchgco.base.version import VERSION
-from torchgco.compiled import Compiled, compile
 from torchgco.dynamics.names import controls_of, states_of
-from torchgco.export.numbers import Changing, Member
+from torchgco.export.exported import Exported
+from torchgco.export.numbers import Member
+from torchgco.export.periods import compared, periods_of
 from torchgco.export.single import single
-from torchgco.export.source import HERE, Solver, firsts, replaced, table
+from torchgco.export.source import HERE, firsts, replaced
 from torchgco.native.codegen.emit import literal
-from torchgco.native.interior import Kept
 
-PERIODS = 40  # of the test
-EXAMPLE = 20  # of the example
-NEAR = 1e-3  # of the range of controls along the test, that those in single precision may differ from Python's
-DISTURBED = 1e-3  # of the size of each state along the plan: by how much the test's states are off it
+EXAMPLE = 20  # periods of the example
 STACK = 4096  # bytes of a step, at most, on a Cortex-M: matrices lie in the workspace. tests/export/test_stack.py
 SPARE = 4096  # bytes of a sample's stack beside those: for long functions, such as implicit steps
 Build = Literal["cmake", "arduino", "zephyr"]
@@ -41,6 +36,28 @@ TEMPLATES: dict[Build, dict[str, str]] = {
         "samples/NAME/sample.yaml": "zephyr/sample.yaml", "samples/NAME/src/main.c": "main.c",
         "samples/NAME/src/test.c": "test.c",
     },
+}  # fmt: skip
+# What headers say of both kinds of time, and of the number of elements.
+FIXED = {
+    "DEFINED": "STAGES @PERIOD@ /* by which the horizon moves from step to step, unless `stages` says otherwise */",
+    "PERIOD_FIELD": "", "TIMES_FIELD": "", "MOVES": "stages",
+    "MOVED_BY": "The plan before is moved on by so many stages", "GUESS_TIMES": "", "GUESS_NAMED": "",
+    "AGE": "stages", "NO_PLAN": "and there is no plan.",
+}  # fmt: skip
+FREE = {
+    "DEFINED": "PERIOD @PERIOD@ /* s: what `period` begins with */",
+    "PERIOD_FIELD": "    double period; /* s: u is the plan's mean over it; 0: that of its first stage */\n",
+    "TIMES_FIELD": "    double t[@KNOTS@]; /* times of the plan's knots, s: t[NAME_N] is how long it lasts */\n",
+    "MOVES": "elapsed", "MOVED_BY": "The plan before is moved on by the seconds that have `elapsed`",
+    "GUESS_TIMES": ", const double *t", "GUESS_NAMED": " at the times t (N+1) of its knots, s", "AGE": "seconds",
+    "NO_PLAN": "and the first step begins with\n   the plan that was found from the exported start.",
+}  # fmt: skip
+ONE = {"ELEMENTS": "", "ELEMENT_FIELD": "", "OF_ELEMENT": "", "THAT": ""}
+SEVERAL = {
+    "ELEMENTS": "#define NAME_ELEMENTS @B@ /* problems of this form; a workspace is of one of them */\n",
+    "ELEMENT_FIELD": "    int element; /* whose constants these are: NAME_init sets it */\n",
+    "OF_ELEMENT": ", int element",
+    "THAT": "\n   element: from 0 to NAME_ELEMENTS - 1; with another one all steps return NAME_BAD_NUMBER.",
 }  # fmt: skip
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
 #include "NAME.h"
@@ -69,56 +86,20 @@ HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, 
 NEEDS = "typedef char NAME_needs_doubles_of_8_bytes[sizeof(double) == 8 ? 1 : -1];\n"
 
 
-@dataclass(frozen=True)
-class Exported:
-    """What is written."""
-
-    compiled: Compiled
-    kept: Kept
-    solver: Solver
-    changing: Changing
-    name: str
-    receding: bool
-    number: int  # bytes of a number: 8 or 4
-
-    @property
-    def title(self) -> str:
-        p = self.kept.problem
-        return f"{p.n} states, {p.m} controls, {p.N} stages"
-
-    @property
-    def stage(self) -> str:
-        """The length of a stage, s."""
-        return f"{float(torch.as_tensor(self.kept.problem.dynamics.dt).flatten()[0]):g}"
-
-    @property
-    def words(self) -> dict[str, Any]:
-        """What files say of its numbers."""
-        near = f"controls within {NEAR:g} of their range"
-        same, real = ("the same bits, status and iterations", "doubles") if self.number == 8 else (near, "floats")
-        return {"SAME": same, "REAL": real}
-
-    @property
-    def sizes(self) -> tuple[int, int, int]:
-        """Numbers of X, U and K."""
-        p = self.kept.problem
-        return (p.N + 1) * p.n, p.N * p.m, p.N * p.m * p.n
-
-
 def write_files(exported: Exported, folder: Path, build: Build) -> Path:
     """Write them all; returns the folder."""
-    periods, source = _periods(exported), "" if build == "cmake" else "src/"
+    periods, source = periods_of(exported), "" if build == "cmake" else "src/"
     words: dict[str, Any] = {
         "FILES": (HERE / f"{build}.md").read_text().rstrip(),  # before the others: it has marks of its own
         "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
-        "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.kept.problem.x0),
-        "EXAMPLE": EXAMPLE, "PERIODS": len(periods[2]), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
+        "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.problem.x0[0]),
+        "EXAMPLE": EXAMPLE, "PERIODS": len(periods), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
         "STACK": STACK + SPARE,
         **exported.words,
     }  # fmt: skip
     files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}
     for file, template in TEMPLATES[build].items():
-        tables = _compared(exported, *periods) if template == "test.c" else {}
+        tables = compared(exported, periods) if template == "test.c" else {}
         files[file] = _filled(template, exported, **words, **tables)
     files["README.md"] = _readme(exported, words)
     for file, text in files.items():
@@ -138,7 +119,7 @@ def _numbers(values: torch.Tensor) -> str:
 
 
 def _header(exported: Exported) -> str:
-    p, (X, U, K) = exported.kept.problem, exported.sizes
+    p, (X, U, K), (x, u) = exported.problem, exported.sizes, exported.sizes_of_iterate
     statuses = [
         f"    NAME_{status.name} = {status.value}, /* {status.sentence.split(';')[0].rstrip('.')} */"
         for status in Status
@@ -148,23 +129,31 @@ def _header(exported: Exported) -> str:
         for m in exported.changing.members
     ]
     lam = sum(exported.solver.multipliers.values())
-    return _filled(
-        "controller.h", exported, **exported.words, TITLE=exported.title, NX=p.n, NU=p.m, N=p.N, DT=exported.stage,
-        STAGES=float(exported.receding), STATUSES="\n".join(statuses),
-        NUMBERS="\n".join(members) or "    double none; /* no number may change */",
-        MAX_ITERATIONS=exported.compiled.interior.max_iterations, SIZE_X=X, SIZE_U=U, SIZE_K=K,
-        MULTIPLIERS=f"    double lam[{lam}];" if lam else "", ROOM=exported.solver.room,
-    )  # fmt: skip
+    kind = FREE if exported.is_free else FIXED
+    shapes = {"SIZE_X": X, "SIZE_U": U, "SIZE_K": K, "SIZE_x": x, "SIZE_u": u, "ROOM": exported.solver.room}
+    words: dict[str, Any] = {
+        **exported.words, **kind, **(SEVERAL if p.B > 1 else ONE), **shapes, "TITLE": exported.title,
+        "NX": p.n, "NU": p.m, "N": p.N, "KNOTS": p.N + 1, "B": p.B, "DT": exported.stage,
+        "PERIOD": f"{exported.period!r}",
+        "STATUSES": "\n".join(statuses), "NUMBERS": "\n".join(members) or "    double none; /* no number may change */",
+        "MAX_ITERATIONS": exported.compiled.interior.max_iterations,
+        "MULTIPLIERS": f"    double lam[{lam}];" if lam else "",
+    }  # fmt: skip
+    return _filled("controller.h", exported, **words)
 
 
 def _code(exported: Exported) -> str:
-    p, solver = exported.kept.problem, exported.solver
+    p, solver, many = exported.kept.problem, exported.solver, exported.problem.B > 1
     none = "    memset(w->lam, 0, sizeof w->lam);" if solver.multipliers else "    (void)w;"
     shifts = [
         f"        shift(w->lam + {first}, b->constraints[{i}].place, N + 1, {p.row_shapes[i][1]}, by);"
         for i, first in firsts(solver.multipliers).items()
     ]
-    parts = {"NO_MULTIPLIERS": none, "SHIFTS": "\n".join(shifts)}
+    own = ["    w->element = element;"] * many + [f"    w->period = {exported.period!r};"] * exported.is_free
+    parts = {
+        "NO_MULTIPLIERS": none, "SHIFTS": "\n".join(shifts), "OWN": "\n".join(own),
+        "OF_ELEMENT": ", int element" * many, "OF_TIMES": ", const double *t" * exported.is_free,
+    }  # fmt: skip
     head = HEAD.format(version=VERSION)
     needs = NEEDS if exported.number == 8 else ""
     return (
@@ -172,58 +161,16 @@ def _code(exported: Exported) -> str:
     )
 
 
-def _periods(exported: Exported) -> tuple[list[np.ndarray], list[np.ndarray], list[int]]:
-    """States, controls and iterations of periods in Python, as long as all converge."""
-    compiled = compile(
-        exported.compiled.now, "interior_point", ["x0"], exported.receding, exported.compiled.interior.tolerance
-    )
-    bounds, N = compiled.problem.control_bounds, compiled.problem.N
-    x, draws = compiled.problem.x0[0].numpy().copy(), np.random.default_rng(0)
-    first = x
-    states, controls, iterations = list[np.ndarray](), list[np.ndarray](), list[int]()
-    while len(states) < PERIODS:
-        answer = compiled.call({"x0": x})
-        if answer.statuses != [Status.CONVERGED]:
-            break
-        u = answer.u
-        if bounds is not None:
-            low, high = bounds.over(N)
-            u = torch.minimum(torch.maximum(u, low[:, 0]), high[:, 0])
-        states.append(x)
-        controls.append(u[0].numpy())
-        iterations.append(int(answer.iterations[0]))
-        size = answer.X[0].abs().amax(0).numpy()
-        x = (answer.X[0, 1].numpy() if exported.receding else first) + DISTURBED * size * draws.standard_normal(len(x))
-    return states, controls, iterations
-
-
-def _compared(
-    exported: Exported, states: list[np.ndarray], controls: list[np.ndarray], iterations: list[int]
-) -> dict[str, str]:
-    """What the test compares with, and how: in double precision all bits."""
-    flat = lambda rows: [float(value) for row in rows for value in row] or [0.0]
-    is_double = exported.number == 8
-    near = NEAR * np.ptp(np.array(controls or [np.zeros(exported.kept.problem.m)]), axis=0)
-    tables = [
-        table("static const double states[]", flat(states)),
-        table("static const double controls[]", flat(controls)),
-        table("static const double near[]", [0.0] * len(near) if is_double else near.tolist()),
-        *([table("static const int iterations[]", iterations or [0])] if is_double else []),
-    ]
-    bits = "The bits are those of a processor with fused products, and of -ffp-contract=off."
-    wrong = bits if is_double else "Controls differ by more than rounding in single precision makes them."
-    same = " && workspace.iterations == iterations[k]" if is_double else ""
-    return {"TABLES": "\n".join(tables), "ITERATIONS": same, "OTHERWISE": wrong}
-
-
 def _readme(exported: Exported, words: dict[str, Any]) -> str:
     rows = [
         f"| `{m.name}` | {' x '.join(map(str, m.shape))} | `{m.full}` | {_shown(m)} | {_unit(m, exported)} |"
         for m in exported.changing.members
     ]
-    (X, U, K), lam = exported.sizes, sum(exported.solver.multipliers.values())
+    lam = sum(exported.solver.multipliers.values())
     count = sum(m.size for m in exported.changing.members) or 1
-    workspace = exported.number * (2 * X + 2 * U + K + lam + count) + 8 * exported.solver.room + 64
+    count += sum(exported.sizes) + sum(exported.sizes_of_iterate) + lam
+    count += (exported.problem.N + 2) * exported.is_free  # times, and a period
+    workspace = exported.number * count + 8 * exported.solver.room + 64
     return _filled(
         "README.md", exported, **words, WORKSPACE=f"{workspace:,}", TABLES=f"{exported.solver.flash:,}",
         BYTES=f"{STACK:,}", ROWS="\n".join(rows) or "| | | | | |",
@@ -231,13 +178,15 @@ def _readme(exported: Exported, words: dict[str, Any]) -> str:
 
 
 def _shown(member: Member) -> str:
-    values = member.value.ravel()
+    values = member.values[0].ravel()
+    if not (member.values == member.values[:1]).all():
+        return "by element"
     return ", ".join(f"{value:g}" for value in values) if values.size <= 4 else f"{values.size} numbers"
 
 
 def _unit(member: Member, exported: Exported) -> str:
     """The units of a member's entries, where the problem's parts say."""
-    last, dynamics = member.full.rpartition(".")[2], exported.kept.problem.dynamics
+    last, dynamics = member.full.rpartition(".")[2], exported.problem.dynamics
     states, controls = ([component.unit for component in of(dynamics)] for of in (states_of, controls_of))
     if last in ("x_ref", "u_ref"):
         return ", ".join(states if last == "x_ref" else controls)

@@ -28,12 +28,14 @@ WITHOUT_ERRNO = "-fno-math-errno"
 WITHOUT_RED_ZONE = ("-mno-red-zone",)
 _MEMBER = re.compile(r"^    (double|float|int) ([^;]+);(?: /\* ([\d x]+): (\S+) \*/)?", re.MULTILINE)
 _ONE, _CLOCK = re.compile(r"(\w+)(?:\[(\d+)\])?"), "double (*clock)(void);"
-_SIZE = re.compile(r"^#define \w+_(NX|NU|N|STAGES) ([\d.]+)(?:.* ([\d.e-]+) s \*/)?", re.MULTILINE)
+_SIZE = re.compile(r"^#define \w+_(NX|NU|N|STAGES|PERIOD|ELEMENTS) ([\d.e-]+)(?:.* ([\d.e-]+) s \*/)?", re.MULTILINE)
 _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double)
 _KINDS = {"double": ctypes.c_double, "float": ctypes.c_float, "int": ctypes.c_int}
 
 
-def load_c(folder: str | Path, name: str | None = None, period: float | None = None) -> LoadedController:
+def load_c(
+    folder: str | Path, name: str | None = None, period: float | None = None, element: int = 0
+) -> LoadedController:
     """The controller of a folder that `export_c` has written, compiled by this machine's compiler.
 
         controller = torchgco.load_c("car_c")
@@ -45,9 +47,10 @@ def load_c(folder: str | Path, name: str | None = None, period: float | None = N
     Args:
         name: of the controller; None: the only one in the folder.
         period: s, from one step to the next; None: what the horizon moves by at each step.
+        element: of those that were exported: each has a controller of its own.
 
     Raises:
-        InputError: no folder with such a controller, or several.
+        InputError: no folder with such a controller, or several; no such element.
         NativeError: there is no compiler, or it refuses the code.
     """
     folder = Path(folder)
@@ -58,7 +61,7 @@ def load_c(folder: str | Path, name: str | None = None, period: float | None = N
     if name is None or found.count(name) != 1:  # two: of one name for two kinds of `build`
         raise InputError("folder", "one with a controller of `export_c`", f"{', '.join(found) or 'none'} in {folder}")
     code = headers[name].with_suffix(".c").read_text()
-    return LoadedController(headers[name].read_text(), code, name, period)
+    return LoadedController(headers[name].read_text(), code, name, period, element)
 
 
 class LoadedController:
@@ -66,14 +69,19 @@ class LoadedController:
 
     Attributes:
         n, m, N: numbers of states, controls and stages; dt: of a stage, s.
+        elements: how many were exported.
         t: time of the last step, s.
     """
 
-    def __init__(self, header: str, code: str, name: str, period: float | None) -> None:
+    def __init__(self, header: str, code: str, name: str, period: float | None, element: int) -> None:
         sizes = {size: (float(value), unit) for size, value, unit in _SIZE.findall(header)}
         self.n, self.m, self.N = (int(sizes[size][0]) for size in ("NX", "NU", "N"))
-        self.dt, self._stages = float(sizes["N"][1]), sizes["STAGES"][0]
-        self.period = self._stages * self.dt if period is None else check_value(period, Seconds, "period")
+        self.dt, self._is_free = float(sizes["N"][1]), "PERIOD" in sizes
+        usual = sizes["PERIOD"][0] if self._is_free else sizes["STAGES"][0] * self.dt
+        self.period = usual if period is None else check_value(period, Seconds, "period")
+        self.elements = int(sizes.get("ELEMENTS", (1, ""))[0])
+        if isinstance(element, bool) or not isinstance(element, int) or not 0 <= element < self.elements:
+            raise InputError("element", f"one of the {self.elements} that were exported, from 0 on", shown(element))
         self._shapes, kinds = _layout(header)
         single = f"float u[{name}_NU]" in header
         self._dtype: Any = np.float32 if single else np.float64
@@ -85,7 +93,10 @@ class LoadedController:
         self._functions = {word: getattr(library, f"{name}_{word}") for word in ("init", "reset", "guess", "step")}
         self._functions["step"].restype = ctypes.c_int
         self._workspace = kinds()
-        self._functions["init"](ctypes.byref(self._workspace))
+        several = self.elements > 1
+        self._functions["init"](ctypes.byref(self._workspace), *([ctypes.c_int(element)] if several else []))
+        if self._is_free:
+            self._workspace.period = self.period
         self._workspace.clock = self._clock = _CALLBACK(clock.seconds)
         self._numbers = _views(self._workspace, self._shapes)
         self.t, self._begun = 0.0, False
@@ -124,19 +135,32 @@ class LoadedController:
         X, U, K = (torch.from_numpy(array).double() for array in arrays)
         return X, U, K
 
+    @property
+    def times(self) -> Tensor:
+        """Times of the knots of `plan`, (N+1,), s, from its first one on."""
+        if not self._is_free:
+            return self.dt * torch.arange(self.N + 1, dtype=torch.float64)
+        return torch.from_numpy(np.array(self._workspace.t)).double()
+
     def reset(self) -> None:
         """Forget the plan; numbers stay."""
         self._functions["reset"](ctypes.byref(self._workspace))
         self.t, self._begun = 0.0, False
 
-    def guess(self, X: Any, U: Any) -> None:
+    def guess(self, X: Any, U: Any, times: Any = None) -> None:
         """Begin the next step with a plan of states X (N+1, n) and controls U (N, m).
 
+        Args:
+            times: of its knots, (N+1,), s, such as `solution.t[0]`, where the time is free; else None.
+
         Raises:
-            InputError: another shape.
+            InputError: another shape; no times where the time is free, or times where it isn't.
         """
-        arrays = []
-        for name, value, shape in (("X", X, (self.N + 1, self.n)), ("U", U, (self.N, self.m))):
+        arrays, parts = [], [("X", X, (self.N + 1, self.n)), ("U", U, (self.N, self.m))]
+        if (times is not None) != self._is_free:
+            expected = "times of the knots, as the time is free" if self._is_free else "None, as the time is fixed"
+            raise InputError("times", expected, shown(times))
+        for name, value, shape in (*parts, *([("times", times, (self.N + 1,))] if self._is_free else [])):
             array = np.ascontiguousarray(as_floats(value, name))
             if array.shape != shape:
                 raise InputError(name, f"shape {shape}", array.shape)
@@ -167,16 +191,16 @@ class LoadedController:
         new = {name: self._fitting(name, value) for name, value in {**(numbers or {}), **named}.items()}
         for name, floats in new.items():
             self._numbers[name][...] = floats
-        stages = stages_between(later / self.dt) if self._begun else 0.0
+        moved = (later if self._is_free else stages_between(later / self.dt)) if self._begun else 0.0
         u = np.zeros(self.m, self._dtype)
-        self.raw_step(state, stages, math.inf if limit is None else limit, u)
+        self.raw_step(state, moved, math.inf if limit is None else limit, u)
         self.t = (self.t + self.period if self._begun else 0.0) if t is None else t
         self._begun = True
         return torch.from_numpy(u).double()
 
-    def raw_step(self, x: Floats, stages: float, max_seconds: float, u: Floats) -> int:
+    def raw_step(self, x: Floats, moved: float, max_seconds: float, u: Floats) -> int:
         """`NAME_step` itself, with states x (n,) and room for controls u (m,), of C's type; returns what C returns."""
-        times = self._real(stages), ctypes.c_double(max_seconds)
+        times = self._real(moved), ctypes.c_double(max_seconds)
         return int(self._functions["step"](ctypes.byref(self._workspace), self._pointer(x), *times, self._pointer(u)))
 
     def _pointer(self, array: np.ndarray) -> Any:

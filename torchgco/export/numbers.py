@@ -5,15 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchgco.base import numbers as checks
 from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number
-from torchgco.compiled.numbers import Numbers
+from torchgco.compiled import Compiled
+from torchgco.compiled.numbers import KeptInTime, steady
 from torchgco.native.interior import Kept
 from torchgco.native.structures import Array
 
@@ -31,19 +34,18 @@ class Member:
         name: of the member.
         full: its name in the problem, such as "constraints[1].centers".
         first: its place among all numbers of the structure.
-        shape: without the axis of problems.
-        value: as it is exported, of this shape.
+        shape: of one element.
+        values: as they are exported, of this shape, of each element.
         kind: of its check.
-        unit: of its entries, in words; empty where the parts don't say.
     """
 
     name: str
     full: str
     first: int
     shape: tuple[int, ...]
-    value: np.ndarray
+    values: np.ndarray
     kind: int
-    unit: str = ""
+    steady: int = 0  # how many numbers a stage has, of those that are the same at all stages; 0: others
 
     @property
     def size(self) -> int:
@@ -52,7 +54,8 @@ class Member:
 
 @dataclass
 class Copies:
-    """Entries of an array that C reads which are copies of numbers: entry `to` is number `source` of the structure."""
+    """Entries of an element's array that C reads which are copies of numbers: entry `to` is number `source` of the
+    structure."""
 
     to: list[int] = field(default_factory=list)
     source: list[int] = field(default_factory=list)
@@ -75,17 +78,18 @@ class Changing:
     copied: dict[int, Copies]
 
 
-def changing(kept: Kept, numbers: Numbers, asked: Sequence[str] | None) -> Changing:
+def changing(kept: Kept, compiled: Compiled, asked: Sequence[str] | None) -> Changing:
     """The numbers that may change.
 
     Args:
         kept: the packed problem.
-        numbers: all of it.
+        compiled: with all of its numbers.
         asked: their names; None: all that can.
 
     Raises:
         InputError: a name that isn't there, x0, or a number from which what C reads is computed in Python.
     """
+    numbers = compiled.numbers
     every = [numbers.find(name) for name in (numbers if asked is None else asked)]
     members, shared, copied, first = list[Member](), dict[int, int](), dict[int, Copies](), 0
     arrays = {tensor.data_ptr(): tensor for tensor in _read(kept)}
@@ -94,15 +98,18 @@ def changing(kept: Kept, numbers: Numbers, asked: Sequence[str] | None) -> Chang
             if asked is not None:
                 raise InputError("changes", "other numbers than x0, which the states of each step are", "x0")
             continue
-        ways = _ways(kept, number, first, arrays)
+        ways = _ways(kept, compiled, number, first, arrays)
         if ways is None:
             if asked is not None:
                 raise InputError("changes", "numbers that C reads, or copies of them", number.name)
             continue
         name = re.sub(r"\W+", "_", numbers.short(number.name)).strip("_")
-        value = np.atleast_1d(number.value[0])
-        kind = BOUND if number.none is not None else KINDS.get(number.check, FINITE)  # type: ignore[arg-type]
-        members.append(Member(name, number.name, first, value.shape, value, kind))
+        values = number.value.reshape(len(number.value), *(number.value.shape[1:] or (1,)))
+        check: Any = number.check
+        is_steady = isinstance(check, partial) and check.func is steady
+        kind = BOUND if number.none is not None else KINDS.get(check.args[-1] if is_steady else check, FINITE)
+        width = values[0, 0].size if is_steady and values.shape[1] > 1 else 0
+        members.append(Member(name, number.name, first, values.shape[1:], values, kind, width))
         shared |= ways[0]
         for address, own in ways[1].items():
             together = copied.setdefault(address, Copies(bounds=own.bounds))
@@ -125,7 +132,7 @@ def _read(kept: Kept, part: str | int | None = None) -> Iterator[Tensor]:
 
 
 def _ways(
-    kept: Kept, number: Number, first: int, arrays: dict[int, Tensor]
+    kept: Kept, compiled: Compiled, number: Number, first: int, arrays: dict[int, Tensor]
 ) -> tuple[dict[int, int], dict[int, Copies]] | None:
     """Where C reads a number as it is, and the copies of it, from its place in the structure on; None: neither."""
     places, at = dict[int, int](), first
@@ -136,45 +143,55 @@ def _ways(
         return places, {}
     if number.name.rpartition(".")[2] in (RADII, RADIUS) and _is_of_spheres(kept, number):
         return {}, {}  # see _add_radii
-    copies = _probed(kept, number, first)
+    copies = _probed(kept, compiled, number, first)
     return None if copies is None else ({}, copies)
 
 
-def _probed(kept: Kept, number: Number, first: int) -> dict[int, Copies] | None:
-    """The entries that change with a number, where all of them become one of its entries; None where they don't."""
-    view, draws = number.views[0], np.random.default_rng(0)
+def _probed(kept: Kept, compiled: Compiled, number: Number, first: int) -> dict[int, Copies] | None:
+    """The entries that change with a number, where all of them become one of its entries, the same ones of every
+    element; None where they don't."""
+    view, draws, part = number.views[0], np.random.default_rng(0), number.part
     old, probe = view.copy(), draws.uniform(1.0, 2.0, view.shape)
-    before = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, number.part)}
+    if part == "time":  # of which bounds don't cross
+        probe = old / probe if number.name.endswith(".least") else old * probe
+    part = None if isinstance(kept, KeptInTime) else part  # lifted parts depend on several
+    before = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, part)}
     try:
-        _write(kept, number, probe)
-        after = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, number.part)}
+        _write(kept, compiled, number, probe)
+        after = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, part)}
     finally:
-        _write(kept, number, old)
-    places = {value: i for i, value in enumerate(probe[0].ravel().tolist())}
-    found = dict[int, Copies]()
+        _write(kept, compiled, number, old)
+    found, B = dict[int, Copies](), len(view)
+    places = [{value: i for i, value in enumerate(row)} for row in probe.reshape(B, -1).tolist()]
     for address, tensor in after.items():
-        changed = (tensor != before[address]).flatten().nonzero().flatten().tolist()
-        values = tensor.flatten()[changed].tolist()
-        if any(value not in places for value in values):
+        changed = tensor != before[address]
+        if not bool(changed.any()):
+            continue
+        if len(tensor) != B or not bool((changed == changed[:1]).all()):
             return None
-        if changed:
-            found[address] = Copies(
-                changed, [first + places[value] for value in values], bounds=number.none is not None
-            )
+        at = changed[0].flatten().nonzero().flatten().tolist()
+        pairs = zip(places, tensor.flatten(1)[:, at].tolist(), strict=True)
+        rows = [[there.get(value, -1) for value in row] for there, row in pairs]
+        if any(-1 in row for row in rows) or rows != rows[:1] * B:
+            return None
+        found[address] = Copies(at, [first + place for place in rows[0]], bounds=number.none is not None)
     return found or None
 
 
-def _write(kept: Kept, number: Number, values: np.ndarray) -> None:
+def _write(kept: Kept, compiled: Compiled, number: Number, values: np.ndarray) -> None:
     number.views[0][...] = values
     if number.after is not None:
         number.after()
-    if number.part == "dynamics":
-        kept.refresh_model()
-    elif number.part == "cost":
-        kept.refresh_cost()
-    else:
-        assert isinstance(number.part, int)
-        kept.refresh_constraint(number.part)
+    parts = {number.part}
+    if isinstance(kept, KeptInTime):
+        parts = kept.read(parts, compiled.now)
+    for part in parts:
+        if part == "dynamics":
+            kept.refresh_model()
+        elif part == "cost":
+            kept.refresh_cost()
+        elif isinstance(part, int):
+            kept.refresh_constraint(part)
 
 
 def _is_of_spheres(kept: Kept, number: Number) -> bool:
@@ -190,18 +207,18 @@ def _add_radii(kept: Kept, members: list[Member], copied: dict[int, Copies]) -> 
         if (radii is None and radius is None) or part.kernel != "spheres":
             continue
         (squares,) = kept._numbers[i]["squares"].kept
-        count = squares.numel()
+        count = squares[0].numel()
         pairs = list[int]()
         for j in range(count):
             pairs += [-1 if radii is None else radii.first + j, -1 if radius is None else radius.first]
         copied[squares.data_ptr()] = Copies(list(range(count)), pairs, squares=True)
 
 
-def fixed_radii(kept: Kept, address: int) -> tuple[Tensor, Tensor]:
-    """Radii (M,) of spheres and that of the vehicle (1,), of the squares at an address."""
+def fixed_radii(kept: Kept, address: int) -> Tensor:
+    """Radii of spheres, then that of the vehicle, (B, M + 1), of the squares at an address."""
     parts: Sequence[Any] = kept.problem.constraints
     for part, own in zip(parts, kept._numbers, strict=True):
         if "squares" in own and own["squares"].kept[0].data_ptr() == address:
-            radius = part.vehicle_radius[:1]
-            return part.inflated_radii[0] - radius, radius
+            radius = part.vehicle_radius.unsqueeze(-1)
+            return torch.cat((part.inflated_radii - radius, radius.expand(len(part.inflated_radii), 1)), dim=-1)
     raise AssertionError("squares of spheres")

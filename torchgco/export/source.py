@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.constraints.bounds import LOOSE
+from torchgco.export.beginning import Beginning
 from torchgco.export.numbers import ABOVE_ZERO, AT_LEAST_ZERO, BOUND, Changing, Copies, fixed_radii
 from torchgco.export.single import VIOLATION, options_in_single
+from torchgco.export.tables import table
 from torchgco.lagrangian.barrier import FILTERED
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
@@ -24,9 +26,10 @@ from torchgco.native.includes import C
 from torchgco.native.interior import Kept
 from torchgco.native.packing import kind_of
 from torchgco.problem.problem import Problem
-from torchgco.receding.plan import STAGE_ROUNDING
+from torchgco.receding.plan import KNOT_ROUNDING, STAGE_ROUNDING
 from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import SADDLE_STEPS, InteriorPoint
+from torchgco.solvers.interior import FEW, ROUGH, SADDLE_STEPS, InteriorPoint
+from torchgco.solvers.timing import HELD_FIRST
 
 HERE = Path(__file__).parent / "c"
 TYPES = {
@@ -42,6 +45,7 @@ FILES = "riccati.c", "interior.c", "sweep.h", "rollout.h"  # the interior point,
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
 ON_STACK = 128  # numbers of one stage that a step has on the stack, at most: 1 kB
 HELD = 112  # doubles of the structures Barrier and Track, at most, beside the filter
+OF_ELEMENTS = "constant", "least_cost", "free_start", "map_of"  # pointers to numbers of every element
 SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
 
 
@@ -51,11 +55,13 @@ class Writer:
 
     Attributes:
         places: expressions by address.
+        elements: how many problems tables have numbers of, one after the other; `element` is the one in C.
         tables: definitions of constant arrays.
     """
 
     tensors: dict[int, Tensor]
     places: dict[int, str]
+    elements: int = 1
     tables: list[str] = field(default_factory=list)
     flash: int = 0  # bytes of tables
     number: int = 8  # of a number
@@ -74,34 +80,33 @@ class Writer:
             value = getattr(structure, name)
             if name in given:
                 rows.append(f".{name} = {given[name]}")
+            elif isinstance(value, c.Array):
+                rows += [f".{name} = {self._array(value)}"] if value.data else []
             elif isinstance(value, Structure):
                 inner = self.body(value)
                 rows += [] if inner == "{0}" else [f".{name} = {inner}"]
             elif isinstance(value, ctypes.Array):
                 rows.append(f".{name} = {{{', '.join(self.body(one) for one in value)}}}")
             elif declared.pointer:
-                rows += [f".{name} = {self._pointer(value)}"] if value else []
+                rows += [f".{name} = {self._pointer(value, name in OF_ELEMENTS)}"] if value else []
             elif value != 0:
                 rows.append(f".{name} = {literal(value) if isinstance(value, float) else value}")
         return f"{{{', '.join(rows) or '0'}}}"
 
-    def _pointer(self, address: int) -> str:
+    def _array(self, array: c.Array) -> str:
+        """That of the element."""
+        place = self._pointer(array.data, array.element != 0)
+        fields = {"data": place, "knot": array.knot, "size": array.size}
+        return f"{{{', '.join(f'.{name} = {value}' for name, value in fields.items() if value)}}}"
+
+    def _pointer(self, address: int, by_element: bool) -> str:
+        """Where it begins, of arrays with numbers of every element at those of one."""
         if address not in self.places:
-            self.places[address] = self.table(self.tensors[address])
+            tensor = self.tensors[address]
+            self.places[address] = self.table(tensor)
+            if by_element and self.elements > 1:
+                self.places[address] += f" + element * {tensor.numel() // self.elements}"
         return self.places[address]
-
-
-def table(declared: str, values: Tensor | Iterable[float]) -> str:
-    """The definition of a constant array."""
-    numbers = values.flatten().tolist() if isinstance(values, Tensor) else list(values)
-    texts = [literal(number) if isinstance(number, float) else str(int(number)) for number in numbers]
-    lines, line = [], "   "
-    for text in texts or ["0"]:
-        if len(line) + len(text) > 116:
-            lines.append(line)
-            line = "   "
-        line += f" {text},"
-    return "\n".join([f"{declared} = {{", *lines, line, "};"])
 
 
 @dataclass(frozen=True)
@@ -123,35 +128,41 @@ class Solver:
     flash: int
 
 
-def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, rest: Tensor, number: int) -> Solver:
+def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, begin: Beginning, number: int) -> Solver:
     """The C of a packed problem.
 
     Args:
-        rest: controls (N, m) with which a solve without a guess begins.
+        begin: with what solves begin that have no plan before.
         number: bytes of a number, 8 or 4. The text is of doubles in any case: see `single`.
     """
     problem, how = kept.problem, kept.how
-    multipliers = {i: lam.numel() for i, lam in enumerate(kept.lam) if lam.numel() > 0}
-    writer = Writer(kept_by(how), _places(kept, changing, multipliers), number=number)
+    B, multipliers = problem.B, {i: lam[0].numel() for i, lam in enumerate(kept.lam) if lam.numel() > 0}
+    writer = Writer(kept_by(how), _places(kept, changing, multipliers), B, number=number)
     made = [_made(kept, j, address, copies, number) for j, (address, copies) in enumerate(changing.copied.items())]
     K = len(problem.constraints)
     rows = [writer.body(row) for row in _constraints(kept)]
     fields = writer.body(kept.packed, constraint="b->constraints", arena="&b->arena")
     options = writer.body(how, of="&b->problem", **({} if number == 8 else _other_options(interior)))
-    lines = _bound(rows, fields, options, changing, made, _rest(kept, changing, writer, rest))
+    lines = _bound(rows, fields, options, changing, made, _rest(changing, writer, begin), begin)
     count = _count(kept)
-    made_numbers = sum(kept_by(how)[address].numel() for address in changing.copied)
-    numbers = count + 2 * FILTERED + _solve_numbers(problem) + made_numbers
+    made_numbers = sum(kept_by(how)[address].numel() // B for address in changing.copied)
+    numbers = count + 2 * FILTERED + _solve_numbers(problem, begin) + made_numbers
     room = structure_numbers(K) + -(-numbers * number // 8)
     texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
+    parts = {"CONTACT": "contact.c", "FREE_TIME": "free_time.c" if begin.segments else None}
+    text = (HERE / "controller.c").read_text()
+    for mark, file in parts.items():
+        text = text.replace(f"@{mark}@\n", "" if file is None else (HERE / file).read_text())
     own = [
-        _constants(interior, bool(K), number), "enum { N = NAME_N };", *writer.tables, *(part.tables for part in made),
-        _numbers_table(changing), _depths(kept), _structure(K, [part.declared for part in made]),
-        _assertion(count, K), lines, _checks(changing), (HERE / "controller.c").read_text(),
+        _constants(interior, bool(K), number), _sizes(B, begin, count, multipliers), *writer.tables,
+        *(part.tables for part in made), *begin.tables(), _numbers_table(changing, B), _depths(kept),
+        _structure(K, [part.declared for part in made], begin),
+        _assertion(count, K), lines, _checks(changing), text,
     ]  # fmt: skip
-    flash = writer.flash + number * sum(m.size for m in changing.members) + sum(part.flash for part in made)
+    flash = writer.flash + number * sum(m.size * B for m in changing.members) + sum(part.flash for part in made)
+    flash += number * begin.count
     sizes = {"KINDS": sum(1 << kind for kind in _kinds(kept)), "ON_STACK": ON_STACK}
     solver = kept.engine.form.alone(FILES, texts, declared, **sizes)
     return Solver(solver, "\n".join(own), room, multipliers, flash)
@@ -185,11 +196,11 @@ def structure_numbers(K: int) -> int:
     return own + (K + 1) * (POINTERS_OF_ROWS + 2) + HELD + SCALARS
 
 
-def _solve_numbers(problem: Problem) -> int:
+def _solve_numbers(problem: Problem, begin: Beginning) -> int:
     """How many numbers the arrays of the structure Solve have, but for those that are made."""
     N, n, m = problem.N, problem.n, problem.m
-    stage = (n + m) * (n + m) + (n + m) * n + n * n
-    return (stage if stage > ON_STACK else 0) + N * m * (n + 1)
+    stage, free = (n + m) * (n + m) + (n + m) * n + n * n, begin.segments + n if begin.segments else 0
+    return (stage if stage > ON_STACK else 0) + N * m * (n + 1) + free
 
 
 def firsts(multipliers: dict[int, int]) -> dict[int, int]:
@@ -222,18 +233,18 @@ class Made:
 
 def _made(kept: Kept, j: int, address: int, copies: Copies, number: int) -> Made:
     (base,) = (tensor for place, tensor in kept_by(kept.how).items() if place == address)
-    size = base.numel()
+    B = kept.problem.B
+    size = base.numel() // B
     tables = [table(f"static const double base_{j}[]", base)]
     places = {"source": copies.source} | ({} if copies.squares else {"to": copies.to})
     tables += [table(f"static const int32_t {name}_{j}[]", map(int, values)) for name, values in places.items()]
-    lines = [f"    memcpy(b->made_{j}, base_{j}, sizeof base_{j});"]
+    lines = [f"    memcpy(b->made_{j}, base_{j} + element * {size}, sizeof b->made_{j});"]
     if copies.squares:
-        radii, radius = fixed_radii(kept, address)
-        tables += [table(f"static const double fixed_{j}[]", torch.cat((radii, radius)))]
+        tables += [table(f"static const double fixed_{j}[]", fixed_radii(kept, address))]
+        at = f"fixed_{j}[element * {size + 1} + "
+        fixed = f"{at}i], {at}{size}]"
         lines.append(f"    for (int i = 0; i < {size}; i++)")
-        lines.append(
-            f"        fill_square(b->made_{j} + i, numbers, source_{j} + 2 * i, fixed_{j}[i], fixed_{j}[{size}]);"
-        )
+        lines.append(f"        fill_square(b->made_{j} + i, numbers, exported, source_{j} + 2 * i, {fixed});")
     else:
         to = f"b->made_{j}[to_{j}[i]]"
         lines.append(f"    for (int i = 0; i < {len(copies.to)}; i++) {to} = numbers[source_{j}[i]];")
@@ -243,22 +254,27 @@ def _made(kept: Kept, j: int, address: int, copies: Copies, number: int) -> Made
     return Made("\n".join(tables), f"    double made_{j}[{size}];", lines, flash)
 
 
-def _rest(kept: Kept, changing: Changing, writer: Writer, rest: Tensor) -> str:
+def _rest(changing: Changing, writer: Writer, begin: Beginning) -> str:
     """Where the controls lie with which a solve without a guess begins: the cost's reference, where it may change."""
-    u_ref = next((m for m in changing.members if m.full == "cost.u_ref"), None)
-    if u_ref is not None and u_ref.size == rest.numel() and bool((torch.from_numpy(u_ref.value) == rest).all()):
+    rest, u_ref = begin.rest, next((m for m in changing.members if m.full == "cost.u_ref"), None)
+    if u_ref is not None and u_ref.values.size == rest.numel() and bool((torch.from_numpy(u_ref.values) == rest).all()):
         return f"numbers + {u_ref.first}"
-    return writer.table(rest)
+    return f"{writer.table(rest)} + element * {rest[0].numel()}"
 
 
-def _bound(rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str) -> str:
+def _bound(
+    rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str, begin: Beginning
+) -> str:
     """The function `bind`, which fills the structures that the solver reads."""
     lines = [
+        UNKNOWN,
         SQUARES if any(copies.squares for copies in changing.copied.values()) else "",
         LIMITED if any(copies.bounds for copies in changing.copied.values()) else "",
         "static void bind(NAME_workspace *w, Solve *b) {",
         "    const double *numbers = (const double *)(const void *)&w->numbers;",
-        "    (void)numbers;",
+        "    const int element = unknown(ELEMENT(w));",
+        "    const double *exported = (const double *)(const void *)(exported_numbers + element);",
+        "    (void)numbers; (void)exported; (void)element;",
         "    memset(b, 0, sizeof *b);",
         *(line for part in made for line in part.lines),
         *(f"    b->constraints[{i}] = (Constraint){row};" for i, row in enumerate(rows)),
@@ -267,6 +283,9 @@ def _bound(rows: list[str], problem: str, how: str, changing: Changing, made: li
         "    b->follow = b->problem;",
         "    b->follow.gains = b->gains;",
         f"    b->rest = {rest};",
+        "    b->contact_depth = contact_depth + element * " + str(max(1, len(rows))) + ";",
+        "    b->most = MAX_SOLVE_ITERATIONS;",
+        *(FREE_TIME if begin.segments else []),
         "    b->arena_begin = (unsigned char *)(b + 1);",
         "    b->arena.next = b->arena_begin;",
         "    b->arena_end = (unsigned char *)w->room + sizeof w->room;",
@@ -279,10 +298,22 @@ def _bound(rows: list[str], problem: str, how: str, changing: Changing, made: li
     return "\n".join(line for line in lines if line)
 
 
+FREE_TIME = (
+    "    b->first_factor = first_factor + element * SEGMENTS;",
+    "    memcpy(b->free_start, b->how.free_start, sizeof b->free_start);",
+    "    b->how.free_start = b->free_start; /* that of the time may be held */",
+)
+UNKNOWN = """
+/* A value that no compiler knows: gcc 12.2 with AVX-512 copies small constant arrays {5, 5, 0, 0} as {5, 5, 5, 5}. */
+static int unknown(int value) {
+    volatile int kept = value;
+    return kept;
+}
+"""
 SQUARES = """
 /* The square of a radius and the vehicle's, of which one may change; what was exported stays to the last bit. */
-static void fill_square(double *square, const double *numbers, const int32_t *source, double radius, double vehicle) {
-    const double *exported = (const double *)(const void *)&exported_numbers;
+static void fill_square(double *square, const double *numbers, const double *exported, const int32_t *source,
+    double radius, double vehicle) {
     double r = source[0] < 0 ? radius : numbers[source[0]], v = source[1] < 0 ? vehicle : numbers[source[1]];
     int same = (source[0] < 0 || r == exported[source[0]]) && (source[1] < 0 || v == exported[source[1]]);
     if (!same) *square = (r + v) * (r + v);
@@ -314,24 +345,49 @@ def _constants(interior: InteriorPoint, constrained: bool, number: int) -> str:
     return defines(values)
 
 
-def _numbers_table(changing: Changing) -> str:
-    inner = "".join(
-        f"    .{member.name} = {{{', '.join(literal(value) for value in member.value.ravel().tolist())}}},\n"
-        for member in changing.members
-    )
-    return f"static const NAME_numbers exported_numbers = {{\n{inner or '    0'}\n}};"
+def _sizes(B: int, begin: Beginning, count: int, multipliers: dict[int, int]) -> str:
+    """What the controller knows of the problem beside the solver's own sizes."""
+    of_many = {"ELEMENT(w)": f"((unsigned)(w)->element < {B}u ? (w)->element : 0)"}
+    of_many["HAS_ELEMENT(w)"] = f"((unsigned)(w)->element < {B}u)"
+    words = of_many if B > 1 else {"ELEMENT(w)": 0, "HAS_ELEMENT(w)": 1}
+    values: dict[str, Any] = {"SEGMENTS": begin.segments, "HAS_PLAN": int(begin.plan is not None)}
+    if begin.segments:
+        values |= {
+            "STAGE": begin.stage,
+            "USER_CONSTRAINTS": begin.constraints,
+            "KNOT_ROUNDING": KNOT_ROUNDING,
+            "LONGER": HELD_FIRST,
+            "FEW": FEW,
+            "ROUGH": ROUGH,
+        }
+        values |= {"ROOM_NUMBERS": count, "MOST_MULTIPLIERS": max(multipliers.values())}
+    return defines(words | values) + "enum { N = NAME_N, USER_NX = NAME_NX, USER_NU = NAME_NU };"
+
+
+def _numbers_table(changing: Changing, B: int) -> str:
+    inner = [
+        "".join(
+            f"    .{member.name} = {{{', '.join(literal(value) for value in member.values[b].ravel().tolist())}}},\n"
+            for member in changing.members
+        )
+        for b in range(B)
+    ]
+    rows = ",\n".join(f"{{\n{row or '    0'}\n}}" for row in inner)
+    return f"static const NAME_numbers exported_numbers[] = {{{rows}}};"
 
 
 def _depths(kept: Kept) -> str:
-    """How deep beneath the full surface bodies touch, m, of each constraint."""
-    depths = []
+    """How deep beneath the full surface bodies touch, m, of each element and constraint."""
+    B, depths = kept.problem.B, [torch.zeros(kept.problem.B, 1, dtype=torch.float64)]
     for part in kept.problem.constraints:
         own = getattr(part, "contact_depths", None) if part.geometric else None
-        depths.append(float(own.min()) if own is not None and own.numel() else 0.0)
-    return table("static const double contact_depth[]", depths or [0.0])
+        least = None if own is None or own.numel() == 0 else own.flatten(1).amin(1).double()
+        depths.append(torch.zeros_like(depths[0]) if least is None else least.expand(B).unsqueeze(1))
+    every = torch.cat(depths[1:] or depths, dim=1)
+    return table("static const double contact_depth[]", every)
 
 
-def _structure(K: int, made: list[str]) -> str:
+def _structure(K: int, made: list[str], begin: Beginning) -> str:
     return "\n".join(
         [
             "/* What a step works with, at the beginning of a workspace's room. */",
@@ -342,9 +398,13 @@ def _structure(K: int, made: list[str]) -> str:
             "    Problem problem, follow; /* follow: of rollouts, and of what they are worth */",
             f"    Constraint constraints[{max(1, K)}];",
             "    const double *rest; /* (N, NU) */",
+            "    const double *contact_depth; /* of each constraint */",
+            *(["    const double *first_factor; /* (SEGMENTS) */"] if begin.segments else []),
+            *(["    double factor[SEGMENTS]; /* with which a solve from rest begins */"] if begin.segments else []),
+            *(["    double free_start[NX];"] if begin.segments else []),
             "    double mu, error, theta, falls, cost;",
             "    int64_t iterations;",
-            "    int32_t status;",
+            "    int32_t status, most; /* most: iterations of a solve */",
             "    double *X, *U, *beside; /* as x and u: the end of the room, while nothing is solved */",
             "    double gains[N * NU * NZ];",
             *made,
@@ -361,10 +421,13 @@ def _assertion(count: int, K: int) -> str:
 def _checks(changing: Changing) -> str:
     """What is checked of the numbers."""
     spans = [f"{{{m.first}, {m.size}, {m.kind}}}" for m in changing.members] or ["{0, 0, 0}"]
+    steady = [f"{{{m.first}, {m.steady}}}" for m in changing.members if m.steady] or ["{0, 0}"]
     return "\n".join(
         [
             "/* Of numbers the first, how many, and whether they are finite, at least 0, above 0, or bounds. */",
-            f"static const struct {{ int first, count, kind; }} checks[] = {{{', '.join(spans)}}};\n",
+            f"static const struct {{ int first, count, kind; }} checks[] = {{{', '.join(spans)}}};",
+            "/* Those of a free time that are the same at all stages: the first, and how many a stage has. */",
+            f"static const struct {{ int first, width; }} steady[] = {{{', '.join(steady)}}};\n",
         ]
     )
 

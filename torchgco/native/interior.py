@@ -215,6 +215,8 @@ class Kept(KeptProblem):
         self._later = dict[int, list[np.ndarray | None]]()
         self._rolled, self._x0 = [part.numpy() for part in self.rolled], problem.x0.numpy()
         self._flat = [part.reshape(B, -1) for part in self._rolled]
+        free = problem.free_start
+        self._held = True if free is None else (~free).numpy()  # which components of the starts are given
         self._gains = self.gains.numpy()
         self._feedback = self._gains[..., :-1]
         self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
@@ -289,8 +291,8 @@ class Kept(KeptProblem):
         return x, u, K, status, iterations
 
     def start(self) -> None:
-        """Let all trajectories begin at the problem's starts."""
-        self._moving[0][:, 0] = self._x0
+        """Let all trajectories begin at the problem's starts; what is free of these stays as it is."""
+        np.copyto(self._moving[0][:, 0], self._x0, where=self._held)
 
     def shift(self, by: float) -> None:
         """Let all trajectories and multipliers begin `by` stages later, as `Solution.shifted` does.

@@ -401,4 +401,4 @@ def _between(values: Tensor, index: Tensor) -> Tensor:
     k = index.floor().long().clamp(0, max(0, values.shape[1] - 2))
     share = (index - k).unsqueeze(-1)
     low, high = (values.gather(1, i.unsqueeze(-1).expand(-1, -1, values.shape[-1])) for i in (k, k + 1))
-    return torch.lerp(low, high, share)
+    return (1.0 - share) * low + share * high  # exact at both ends; exported C rounds alike, which it doesn't as lerp

@@ -56,9 +56,12 @@ class Plan:
     @property
     def t(self) -> Tensor:
         """Times of the knots, (B, N+1), s."""
-        if self.knots is not None:
-            return self.start.unsqueeze(-1) + self.knots
-        return self.start.unsqueeze(-1) + self.dt * torch.arange(self.X.shape[1], dtype=self.start.dtype)
+        return self.start.unsqueeze(-1) + (self._from_start if self.knots is None else self.knots)
+
+    @property
+    def _from_start(self) -> Tensor:
+        """Times of knots dt apart from `start` on, (1, N+1), s."""
+        return self.dt * torch.arange(self.X.shape[1], dtype=self.start.dtype).unsqueeze(0)
 
     @property
     def end(self) -> Tensor:
@@ -113,12 +116,15 @@ class Plan:
         Where the time is free, stages may be shorter than the period for which a vehicle holds its controls.
         """
         with computing_on(CPU):
-            knots = self.t.numpy()
-            last = np.maximum(knots[:, -1:], t + seconds)  # after the end the last control holds
-            knots = np.concatenate((np.minimum(knots[:, :1], t), knots[:, 1:-1], last), axis=1)
-            within = np.clip(knots, t, t + seconds)
+            knots = (self._from_start if self.knots is None else self.knots).numpy()
+            since = t - self.start.numpy()[:, None]  # a loop's bits don't depend on when it began
+            last = np.maximum(knots[:, -1:], since + seconds)  # after the end the last control holds
+            knots = np.concatenate((np.minimum(knots[:, :1], since), knots[:, 1:-1], last), axis=1)
+            within = np.clip(knots, since, since + seconds)
             shares = torch.from_numpy(np.diff(within, axis=1) / seconds)
-            return self._at(t, None if x is None else self._states(x), (shares.unsqueeze(1) @ self.U).squeeze(1)).u
+            # In the order of the stages, as exported C adds them: a product of matrices has another on each processor.
+            u = (shares.unsqueeze(-1) * self.U).cumsum(1)[:, -1]
+            return self._at(t, None if x is None else self._states(x), u).u
 
     def _at(self, t: float, measured_x: Tensor | None, u: Tensor | None = None) -> Instant:
         """`at`; with other controls u (B, m) than those of the stage, where they are given."""

@@ -1,5 +1,5 @@
 """`torchgco-export RUN`: the trajectories of a finished study, as CSV with names and units or as bags of ROS 2; or the
-controller of one of its problems as C."""
+controller of its problems as C."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def _parser() -> RunParser:
     kinds = list(get_args(Storage))
     parser.add_argument("--bag", metavar="KIND", choices=kinds, help=f"bags of ROS 2 instead: {' or '.join(kinds)}")
     parser.add_argument(
-        "--c", metavar="NAME", help="instead the C of this name that controls the first, or the only --layout"
+        "--c", metavar="NAME", help="instead the C of this name that controls the first layout, or those of --layout"
     )
     parser.add_argument(
         "--changes",
@@ -221,7 +221,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _write_c(options: argparse.Namespace) -> int:
-    """The controller of one problem, of a study or of a configuration."""
+    """The controller of problems, of a study or of a configuration: each layout is an element."""
     words, name = options.run, options.c
     if given := [word for word in ("rate", "solver", "bag") if getattr(options, word)]:
         raise InputError(f"--{given[0]}", "none beside --c", getattr(options, given[0]))
@@ -235,10 +235,10 @@ def _write_c(options: argparse.Namespace) -> int:
     if missions:
         raise InputError("RUN", "single trajectories: a mission's planner searches, which C doesn't", "missions")
     ids = layouts.ids.tolist()
-    layout = (options.layout or ids[:1])[0]
-    if len(options.layout) > 1 or layout not in ids:
-        raise InputError("--layout", f"one of {', '.join(map(str, ids[:20]))}", options.layout[-1])
-    problem = vehicle.task(layouts.take(np.array([ids.index(layout)]))).problem
+    asked = list(dict.fromkeys(options.layout)) or ids[:1]
+    if missing := [layout for layout in asked if layout not in ids]:
+        raise InputError("--layout", f"one of {', '.join(map(str, ids[:20]))}", missing[0])
+    problem = vehicle.task(layouts.take(np.array([ids.index(layout) for layout in asked]))).problem
     dtype = torch.float32 if options.single else torch.float64
     target, build = options.output or output, options.build or "cmake"
     written = export_c(problem, target, name, changes=options.changes, build=build, dtype=dtype)

@@ -55,15 +55,16 @@ static void bounds_at(const Constraint *con, int64_t k, int v, double *lower, do
     }
 }
 
-/* u within the bounds of controls at knot k, but for those that cross; what is no number becomes 0 first. */
-static void clamp(const Solve *b, int64_t k, double *u) {
+/* The first `count` controls u within their bounds at knot k, but for those that cross; what is no number becomes 0
+   first. */
+static void clamp(const Solve *b, int64_t k, int count, double *u) {
     const Problem *p = &b->problem;
-    for (int j = 0; j < NU; j++) if (u[j] != u[j]) u[j] = 0;
+    for (int j = 0; j < count; j++) if (u[j] != u[j]) u[j] = 0;
     for (int side = -1; side <= 1; side += 2)
         for (int64_t i = 0; i < p->constraints; i++) {
             const Constraint *con = p->constraint + i;
             if (!is_kind(con, BOUNDS) || con->place[k] == NOWHERE) continue;
-            for (int j = 0; j < NU; j++) {
+            for (int j = 0; j < count; j++) {
                 double lower, upper;
                 bounds_at(con, k, NX + j, &lower, &upper);
                 if (lower > upper) continue;
@@ -75,7 +76,8 @@ static void clamp(const Solve *b, int64_t k, double *u) {
 /* Whether one of the numbers is one that the problem can't have; 2: a bound is. */
 static int has_bad_number(const NAME_workspace *w, const Solve *b) {
     const double *numbers = (const double *)(const void *)&w->numbers;
-    const double *exported = (const double *)(const void *)&exported_numbers;
+    const double *exported = (const double *)(const void *)(exported_numbers + ELEMENT(w));
+    if (!HAS_ELEMENT(w)) return 2;
     for (int i = 0; i < (int)(sizeof checks / sizeof *checks); i++)
         for (int j = checks[i].first; j < checks[i].first + checks[i].count; j++) {
             int kind = checks[i].kind, is_finite_number = numbers[j] - numbers[j] == 0;
@@ -85,6 +87,11 @@ static int has_bad_number(const NAME_workspace *w, const Solve *b) {
             if (numbers[j] != numbers[j] || (kind != BOUND && !is_finite_number)) return kind == BOUND ? 2 : 1;
             if ((kind == AT_LEAST_ZERO && numbers[j] < 0) || (kind == ABOVE_ZERO && numbers[j] <= 0)) return 1;
         }
+#if SEGMENTS
+    for (int i = 0; i < (int)(sizeof steady / sizeof *steady); i++)
+        for (int j = steady[i].width; j < N * steady[i].width; j++)
+            if (numbers[steady[i].first + j] != numbers[steady[i].first + j - steady[i].width]) return 1;
+#endif
     for (int64_t i = 0; i < b->problem.constraints; i++) {
         const Constraint *con = b->problem.constraint + i;
         if (!is_kind(con, BOUNDS)) continue;
@@ -146,10 +153,15 @@ static int judge(Solve *b, double *X, double *U, double *cost, double *violation
     return 1;
 }
 
+/* What is given of the first states X is that of x. */
+static void set_start(const Solve *b, double *X, const double *x) {
+    for (int i = 0; i < USER_NX; i++) if (!b->how.free_start || b->how.free_start[i] == 0) X[i] = x[i];
+}
+
 /* Rollout of U, or with feedback of U + K (x - X), into b->X, b->U, from the states x. */
 static void follow(Solve *b, const double *x, const double *X, const double *U, int feedback) {
     memcpy(b->X, X, (N + 1) * NX * sizeof *X); memcpy(b->U, U, N * NU * sizeof *U);
-    memcpy(b->X, x, NX * sizeof *x);
+    set_start(b, b->X, x);
     b->follow.X = b->X; b->follow.U = b->U;
     roll_out(&b->follow, 0, 1, feedback);
 }
@@ -165,6 +177,7 @@ static int is_rounding(const double *old, const double *new) {
     return 1;
 }
 
+@FREE_TIME@
 static int is_finite_rollout(const Solve *b) { return all_finite(b->X, (N + 1) * NX) && all_finite(b->U, N * NU); }
 
 /* How a solve is to be made. */
@@ -175,9 +188,9 @@ static const How FROM_REST = {COLD_MU, COLD_PUSH, 0, 1};
 /* One solve from the iterate w->x, w->u and its multipliers, in place: b->X, b->U is the rollout that it stands for, and
    w->violation its. Returns whether it is a solution. */
 static int run(NAME_workspace *w, Solve *b, How how, double until) {
-    int left = w->max_iterations > 0 ? w->max_iterations - w->iterations : MAX_SOLVE_ITERATIONS;
+    int left = w->max_iterations > 0 ? w->max_iterations - w->iterations : b->most;
     double cost;
-    b->how.max_iter = left < MAX_SOLVE_ITERATIONS ? left : MAX_SOLVE_ITERATIONS;
+    b->how.max_iter = left < b->most ? left : b->most;
     b->how.seconds = until - seconds_of(&b->arena);
     b->how.bound_push = how.push; b->how.warm = how.warm; b->how.minimum = how.minimum;
     b->mu = how.mu; b->iterations = 0; b->status = RUNNING; b->falls = 0;
@@ -210,25 +223,46 @@ static int is_over(const NAME_workspace *w, const Solve *b, double until) {
 
 /* What was found is the plan from now on. */
 static void fly(NAME_workspace *w, const Solve *b) {
-    memcpy(w->X, b->X, sizeof w->X); memcpy(w->U, b->U, sizeof w->U);
-    for (int i = 0; i < N * NU; i++) for (int j = 0; j < NX; j++) w->K[i * NX + j] = b->gains[i * NZ + j];
+    for (int k = 0; k <= N; k++) memcpy(w->X + k * USER_NX, b->X + k * NX, USER_NX * sizeof *w->X);
+    for (int k = 0; k < N; k++) for (int j = 0; j < USER_NU; j++) {
+        int to = k * USER_NU + j;
+        w->U[to] = b->U[k * NU + j];
+        for (int i = 0; i < USER_NX; i++) w->K[to * USER_NX + i] = b->gains[(k * NU + j) * NZ + i];
+    }
+#if SEGMENTS
+    double factor[SEGMENTS];
+    factors_in(b->X, factor);
+    times_of(factor, w->t);
+#endif
     w->age = 0;
+}
+
+/* The states that a solve from rest begins with: x, also where the start is free, and the factors of time. */
+static void guess_start(NAME_workspace *w, const Solve *b, const double *x) {
+    memcpy(w->x, x, USER_NX * sizeof *x);
+#if SEGMENTS
+    put_factors(w->x, w->u, b->factor);
+#else
+    (void)b;
+#endif
 }
 
 /* Controls at rest, within their bounds, into w->u, and where they lead to from x, into w->x. */
 static void rest(NAME_workspace *w, Solve *b, const double *x) {
     memcpy(w->u, b->rest, sizeof w->u); memcpy(b->beside, w->u, sizeof w->u);
     each_bounded(&b->problem, 1, to_middle, w->x, b->beside);
+    guess_start(w, b, x);
     int middle = 0;
     for (int64_t k = 0; k < N; k++) {
         double held[NU];
         memcpy(held, w->u + k * NU, sizeof held);
-        clamp(b, k, held);
+        clamp(b, k, NU, held);
         for (int j = 0; j < NU; j++) middle |= held[j] != w->u[k * NU + j];
     }
     follow(b, x, w->x, w->u, 0);
     if (middle || !is_finite_rollout(b)) {
         memcpy(w->u, b->beside, sizeof w->u);
+        guess_start(w, b, x);
         follow(b, x, w->x, w->u, 0);
     }
     memcpy(w->x, b->X, sizeof w->x);
@@ -238,69 +272,11 @@ static void rest(NAME_workspace *w, Solve *b, const double *x) {
 static int cold(NAME_workspace *w, Solve *b, const double *x, double until) {
     no_multipliers(w);
     each_bounded(&b->problem, 0, push_inside, w->x, w->u);
-    memcpy(w->x, x, NX * sizeof *x);
+    set_start(b, w->x, x);
     return run(w, b, FROM_REST, until);
 }
 
-#if DIM > 0
-/* By how far the states x lie deeper in the obstacles of constraint i than may be at a start; above 0: too far. */
-static double too_deep(const Lanes *s, int64_t i, const V *x) {
-    const Constraint *con = s->of->constraint + i;
-    double worst = -INFINITY;
-    int64_t k = con->place[0] == NOWHERE && (con->moved || is_kind(con, BODY)) ? 1 : 0;
-    Ball ball;
-    V centers[MAX_ROWS];
-    if (con->place[k] == NOWHERE && k) return worst;
-    if (is_kind(con, BODY)) ball_centers(s, i, k, x, centers);
-    for (int part = 0; part < (is_kind(con, BODY) ? con->balls : 1); part++) {
-        const Constraint *own = con;
-        const Rows *rows = s->rows + i;
-        const V *at_x = x;
-        if (is_kind(con, BODY)) {
-            ball_at(con, rows, part, k, centers + part * DIM, &ball);
-            own = &ball.con; rows = &ball.rows; at_x = ball.x;
-        }
-        for (int j = 0; j < own->rows; j++) {
-            V away[DIM];
-            double deep = -INFINITY;
-            if (is_kind(own, SPHERES)) {
-                double square = square_at(own, rows, j, k), gap = square - sphere(own, rows, j, k, at_x, away);
-                if (square >= 0) deep = CONTACT * sqrt(square) - sqrt(gap);
-            } else if (is_kind(own, BOXES)) {
-                deep = solid(own, rows, j, k, at_x, 0) / (rows->bound + own->rows * 2 * DIM)[j] - contact_depth[i];
-            } else if (is_kind(own, FIELD)) {
-                V c = field_row(own, rows, k, at_x, 0, 0);
-                if (c > 0) deep = depth_of(rows, c) - contact_depth[i];
-            }
-            if (deep > worst) worst = deep;
-        }
-    }
-    return worst;
-}
-#endif
-
-/* Whether the vehicle touches an obstacle at the start. */
-static int starts_inside(Solve *b, const double *x) {
-#if DIM > 0
-    int inside = 0;
-    memcpy(b->X, x, NX * sizeof *x);
-    b->follow.X = b->X; b->follow.U = b->U;
-    b->arena.next = b->arena_begin;
-    LOCAL(Lanes, s, &b->follow);
-    if (!s || !start(s, &b->follow)) return 0;
-    enter_problem(s, 0, 0);
-    for (int64_t i = 0; i < s->of->constraints; i++) {
-        const Constraint *con = s->of->constraint + i;
-        if (is_solid(con) || is_kind(con, BODY)) inside |= too_deep(s, i, s->X) > 0;
-    }
-    finish(s);
-    return inside;
-#else
-    (void)b; (void)x;
-    return 0;
-#endif
-}
-
+@CONTACT@
 /* Controls beside a saddle point, by an uneven share of their size or range. */
 static void step_beside(const Solve *b, double share, double *u) {
     for (int j = 0; j < NU; j++) {
@@ -324,7 +300,7 @@ static void step_beside(const Solve *b, double share, double *u) {
 
 /* From rest; where the conditions of first order hold but the cost falls to second order, from beside, too. Returns the
    status of what is found, in b->X and b->U. */
-static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until) {
+static int from_rest_once(NAME_workspace *w, Solve *b, const double *x, double until) {
     static const double shares[] = {SADDLE_FIRST, SADDLE_LAST};
     double guess_cost, guess_violation, cost, largest = 0;
     if (starts_inside(b, x)) return INVALID_START;
@@ -335,6 +311,7 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
     for (int i = 0; i < 2 && solved && b->falls > 0; i++) {
         memcpy(b->beside, b->U, sizeof w->u);
         step_beside(b, shares[i], b->beside);
+        guess_start(w, b, x);
         memcpy(w->u, b->beside, sizeof w->u);
         follow(b, x, w->x, w->u, 0);
         memcpy(w->x, b->X, sizeof w->x);
@@ -360,16 +337,83 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
     return (fits || w->violation <= ADMITTED) && CONSTRAINED ? FEASIBLE : status;
 }
 
-/* Again from what the plan before leads to now, as far as it keeps the constraints. */
-static int from_plan_before(NAME_workspace *w, Solve *b, const double *x, double until) {
-    double cost, violation, age = rounded(w->age);
-    if (age < 0) return 0;
+#if SEGMENTS
+/* At the time that the solve begins with, roughly; then it is free. Freed at once it may shrink until no trajectory is
+   left. Returns the status of what is found, in b->X and b->U. */
+static int from_held_time(NAME_workspace *w, Solve *b, const double *x, double until) {
+    for (int again = 0; again < 2; again++) {
+        double tolerance = b->how.tol;
+        rest(w, b, x);
+        b->free_start[USER_NX] = 0; b->how.tol = ROUGH; b->most = FEW;
+        cold(w, b, x, until);
+        b->free_start[USER_NX] = 1; b->how.tol = tolerance; b->most = MAX_SOLVE_ITERATIONS;
+        if (!(w->violation <= VIOLATION) || !is_finite_rollout(b)) return b->status == CONVERGED ? MAX_ITERATIONS : b->status;
+        if (again) return FEASIBLE; /* for this time alone */
+        memcpy(w->x, b->X, sizeof w->x); memcpy(w->u, b->U, sizeof w->u);
+        if (cold(w, b, x, until)) return CONVERGED;
+    }
+    return b->status;
+}
+#endif
+
+/* The same; where the time is free and nothing is found, with the time held at first, and with twice the time. */
+static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until) {
+#if SEGMENTS
+    memcpy(b->factor, b->first_factor, sizeof b->factor);
+    if (w->age >= 0) {
+        factors_left(w, b, b->factor);
+        for (int s = 0; s < SEGMENTS; s++) b->factor[s] *= LONGER;
+    }
+    for (int s = 0; s < SEGMENTS; s++) b->factor[s] = within_factors(b, s, b->factor[s]);
+    for (;;) {
+        int longer = 0, status;
+        b->most = FEW;
+        status = from_rest_once(w, b, x, until);
+        b->most = MAX_SOLVE_ITERATIONS;
+        if (status == CONVERGED || status == INVALID_START || is_over(w, b, until)) return status;
+        status = from_held_time(w, b, x, until);
+        if (status == CONVERGED || status == FEASIBLE || is_over(w, b, until)) return status;
+        for (int s = 0; s < SEGMENTS; s++) {
+            double twice = within_factors(b, s, 2 * b->factor[s]);
+            longer |= twice > b->factor[s];
+            b->factor[s] = twice;
+        }
+        if (!longer) return status;
+    }
+#else
+    return from_rest_once(w, b, x, until);
+#endif
+}
+
+/* The plan that is flown as the iterate, from now on, with its feedback in b->gains. */
+static void plan_before(NAME_workspace *w, Solve *b) {
+    memset(b->gains, 0, sizeof b->gains);
+#if SEGMENTS
+    double factor[SEGMENTS];
+    factors_of(b, w->t, factor);
+    lift(w->X, w->U, factor, w->x, w->u);
+    b->arena.next = b->arena_begin;
+    Left left = left_of(b, factor, w->age);
+    move(&left, &b->problem, w->x, w->u);
+    put_factors(w->x, w->u, left.factor);
+    for (int k = 0; k < N; k++) for (int j = 0; j < USER_NU; j++) for (int i = 0; i < USER_NX; i++)
+        b->gains[(k * NU + j) * NZ + i] = between(w->K, N, USER_NU * USER_NX, j * USER_NX + i, left.place[k]);
+#else
+    double age = rounded(w->age);
     for (int i = 0; i < N * NU; i++) for (int j = 0; j < NX; j++) b->gains[i * NZ + j] = w->K[i * NX + j];
     memcpy(w->x, w->X, sizeof w->x); memcpy(w->u, w->U, sizeof w->u);
     shift(w->x, 0, N + 1, NX, age); shift(w->u, 0, N, NU, age); shift(b->gains, 0, N, NU * NZ, age);
+#endif
+}
+
+/* Again from what the plan before leads to now, as far as it keeps the constraints. */
+static int from_plan_before(NAME_workspace *w, Solve *b, const double *x, double until) {
+    double cost, violation;
+    if (w->age < 0) return 0;
+    plan_before(w, b);
     follow(b, x, w->x, w->u, 1);
     memcpy(w->u, b->U, sizeof w->u);
-    for (int64_t k = 0; k < N; k++) clamp(b, k, w->u + k * NU);
+    for (int64_t k = 0; k < N; k++) clamp(b, k, NU, w->u + k * NU);
     follow(b, x, w->x, w->u, 0);
     memcpy(w->x, b->X, sizeof w->x);
     no_multipliers(w);
@@ -377,8 +421,30 @@ static int from_plan_before(NAME_workspace *w, Solve *b, const double *x, double
     return run(w, b, FROM_GUESS, until);
 }
 
+/* The controls for the next period of the plan that was found. */
+static void flown(const NAME_workspace *w, const Solve *b, double *u) {
+#if SEGMENTS
+    mean_controls(w->U, w->t, 0, w->period, u);
+#else
+    memcpy(u, w->U, NU * sizeof *u);
+#endif
+    clamp(b, 0, USER_NU, u);
+}
+
 /* The controls of the plan before with feedback on x, where x is known; without a plan, those at rest. */
 static void hold(const NAME_workspace *w, const Solve *b, const double *x, double *u) {
+#if SEGMENTS
+    int k = 0;
+    memcpy(u, b->rest, USER_NU * sizeof *u);
+    if (w->age >= 0) {
+        double planned[USER_NX];
+        planned_states(w, b, planned, &k);
+        mean_controls(w->U, w->t, w->age, w->period, u);
+        if (w->period <= 0) memcpy(u, w->U + k * USER_NU, USER_NU * sizeof *u);
+        for (int j = 0; x && j < USER_NU; j++)
+            for (int i = 0; i < USER_NX; i++) u[j] += w->K[(k * USER_NU + j) * USER_NX + i] * (x[i] - planned[i]);
+    }
+#else
     double age = rounded(w->age), share = age - (int)age;
     int k = age < N - 1 ? (int)age : N - 1, later = k + 1 < N ? k + 1 : N - 1;
     int knot = age < N ? (int)age : N, next = knot + 1 < N + 1 ? knot + 1 : N;
@@ -395,52 +461,78 @@ static void hold(const NAME_workspace *w, const Solve *b, const double *x, doubl
             u[j] += K * (x[i] - X);
         }
     }
-    if (w->age >= 0) clamp(b, k, u);
-    clamp(b, 0, u);
+#endif
+    if (w->age >= 0) clamp(b, k, USER_NU, u);
+    clamp(b, 0, USER_NU, u);
+}
+
+/* The iterate begins as much later as time has gone on: stages, or seconds where the time is free. */
+static void go_on(NAME_workspace *w, Solve *b, double moved) {
+#if SEGMENTS
+    elapse(w, b, moved);
+#else
+    double by = rounded(moved);
+    (void)b;
+    shift(w->x, 0, N + 1, NX, by); shift(w->u, 0, N, NU, by);
+@SHIFTS@
+#endif
 }
 
 void NAME_reset(NAME_workspace *w) {
     memset(w->X, 0, sizeof w->X); memset(w->U, 0, sizeof w->U); memset(w->K, 0, sizeof w->K);
+#if SEGMENTS
+    memset(w->t, 0, sizeof w->t);
+#endif
     memset(w->x, 0, sizeof w->x); memset(w->u, 0, sizeof w->u);
     no_multipliers(w);
     w->age = -1;
     w->begun = w->able = 0;
     w->status = RUNNING; w->held = w->warm = w->iterations = 0; w->violation = 0;
+#if HAS_PLAN
+    int e = ELEMENT(w);
+    NAME_guess(w, plan_X + e * (N + 1) * USER_NX, plan_U + e * N * USER_NU, plan_t + e * (N + 1));
+#endif
 }
 
-void NAME_init(NAME_workspace *w) {
+void NAME_init(NAME_workspace *w@OF_ELEMENT@) {
     memset(w, 0, sizeof *w);
-    memcpy(&w->numbers, &exported_numbers, sizeof w->numbers);
+@OWN@
+    int e = unknown(ELEMENT(w));
+    memcpy(&w->numbers, exported_numbers + e, sizeof w->numbers);
     NAME_reset(w);
 }
 
-void NAME_guess(NAME_workspace *w, const double *X, const double *U) {
+void NAME_guess(NAME_workspace *w, const double *X, const double *U@OF_TIMES@) {
+#if SEGMENTS
+    double factor[SEGMENTS];
+    Solve *b = (Solve *)(void *)w->room;
+    bind(w, b);
+    factors_of(b, t, factor);
+    lift(X, U, factor, w->x, w->u);
+#else
     memcpy(w->x, X, sizeof w->x); memcpy(w->u, U, sizeof w->u);
+#endif
     no_multipliers(w);
     w->able = 2;
 }
 
-int NAME_step(NAME_workspace *w, const double x[NX], double stages, double max_seconds, double u[NU]) {
+int NAME_step(NAME_workspace *w, const double x[USER_NX], double moved, double max_seconds, double u[USER_NU]) {
     Solve *b = (Solve *)(void *)w->room;
     bind(w, b);
     double until = seconds_of(&b->arena) + max_seconds;
-    int good = 0, late = 0, guessed = w->able == 2, fits = stages >= 0 && stages - stages == 0;
+    int good = 0, late = 0, guessed = w->able == 2, fits = moved >= 0 && moved - moved == 0;
     int bad = has_bad_number(w, b);
-    int status = !fits || !all_finite(x, NX) ? NAME_BAD_STATE : bad ? NAME_BAD_NUMBER : RUNNING;
+    int status = !fits || !all_finite(x, USER_NX) ? NAME_BAD_STATE : bad ? NAME_BAD_NUMBER : RUNNING;
     w->warm = w->iterations = 0;
-    if (fits && w->age >= 0) w->age += stages;
-    if (fits && w->begun && !guessed && stages > 0) {
-        double by = rounded(stages);
-        shift(w->x, 0, N + 1, NX, by); shift(w->u, 0, N, NU, by);
-@SHIFTS@
-    }
+    if (fits && w->age >= 0) w->age += moved;
+    if (fits && w->begun && !guessed && moved > 0) go_on(w, b, moved);
     if (status < 0) {
         hold(w, b, status == NAME_BAD_STATE || bad == 2 ? 0 : x, u); /* without bounds feedback has no end */
         w->held = 1;
         return w->status = status;
     }
-    memcpy(w->x, x, NX * sizeof *x);
-    if (w->able) {
+    set_start(b, w->x, x);
+    if (w->able && !(guessed && starts_inside(b, x))) {
         w->warm = good = run(w, b, guessed ? FROM_GUESS : FROM_PLAN, until);
         status = good ? CONVERGED : b->status;
         late = status == TIME_LIMIT && is_finite_rollout(b);
@@ -455,7 +547,7 @@ int NAME_step(NAME_workspace *w, const double x[NX], double stages, double max_s
     w->begun = 1;
     w->able = good || status == TIME_LIMIT;
     w->held = !good;
-    if (good) { fly(w, b); memcpy(u, w->U, NU * sizeof *u); clamp(b, 0, u); }
+    if (good) { fly(w, b); flown(w, b, u); }
     else hold(w, b, x, u);
     return w->status = status;
 }

@@ -9,11 +9,11 @@ extern "C" {
 #define NAME_NX @NX@ /* states */
 #define NAME_NU @NU@ /* controls */
 #define NAME_N @N@ /* stages, of @DT@ s */
-#define NAME_STAGES @STAGES@ /* by which the horizon moves from step to step, unless `stages` says otherwise */
-
+#define NAME_@DEFINED@
+@ELEMENTS@
 enum {
 @STATUSES@
-    NAME_BAD_STATE = -1, /* x or stages are no finite numbers, or stages are below 0 */
+    NAME_BAD_STATE = -1, /* x or @MOVES@ are no finite numbers, or @MOVES@ below 0 */
     NAME_BAD_NUMBER = -2 /* one of `numbers` is one that the problem can't have */
 };
 
@@ -26,7 +26,7 @@ typedef struct {
     NAME_numbers numbers; /* to be written between steps */
     double (*clock)(void); /* the time, s, for `max_seconds`; 0: it has no effect */
     int max_iterations; /* of a step, in all; 0: @MAX_ITERATIONS@ for each of its solves */
-
+@ELEMENT_FIELD@@PERIOD_FIELD@
     /* What the last step found. */
     int status; /* see above: how the last solve ended */
     int held; /* 1: u isn't of a plan that was found for now, but of the one before, with feedback, or at rest */
@@ -36,26 +36,26 @@ typedef struct {
 
     /* The plan that is flown: u = U + K (x - X); X[k * NAME_NX + i], U[k * NAME_NU + j], K[(k * NAME_NU + j) * NAME_NX + i]. */
     double X[@SIZE_X@], U[@SIZE_U@], K[@SIZE_K@];
-    double age; /* stages since its first knot; below 0: there is none */
+@TIMES_FIELD@    double age; /* @AGE@ since its first knot; below 0: there is none */
 
     /* The solver's own: where it begins, and room that only a step needs. */
     int begun, able;
-    double x[@SIZE_X@], u[@SIZE_U@];
+    double x[@SIZE_x@], u[@SIZE_u@];
 @MULTIPLIERS@
     double room[@ROOM@];
 } NAME_workspace;
 
-/* Makes a workspace ready: the numbers are those that were exported, and there is no plan. */
-void NAME_init(NAME_workspace *w);
+/* Makes a workspace ready: the numbers are those that were exported, @NO_PLAN@@THAT@ */
+void NAME_init(NAME_workspace *w@OF_ELEMENT@);
 
-/* Controls u for the next period from states x measured now. The plan before is moved on by so many stages, and the solver
-   goes on from there; where that fails it begins again from what the plan before leads to now, then from rest, while
+/* Controls u for the next period from states x measured now. @MOVED_BY@,
+   and the solver goes on from there; where that fails it begins again from what the plan before leads to now, then from rest, while
    iterations and seconds are left; where all fail, u is the plan before with feedback. u is within the bounds of controls.
    Returns the status. max_seconds: INFINITY for none. */
-int NAME_step(NAME_workspace *w, const double x[NAME_NX], double stages, double max_seconds, double u[NAME_NU]);
+int NAME_step(NAME_workspace *w, const double x[NAME_NX], double @MOVES@, double max_seconds, double u[NAME_NU]);
 
-/* The next step begins with this plan, of states X (N+1, NX) and controls U (N, NU), from any larger computer. */
-void NAME_guess(NAME_workspace *w, const double *X, const double *U);
+/* The next step begins with this plan, of states X (N+1, NX) and controls U (N, NU)@GUESS_NAMED@, from any larger computer. */
+void NAME_guess(NAME_workspace *w, const double *X, const double *U@GUESS_TIMES@);
 
 /* Forgets the plan; numbers stay. */
 void NAME_reset(NAME_workspace *w);

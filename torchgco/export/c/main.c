@@ -8,9 +8,9 @@ static NAME_workspace workspace; /* one per vehicle and thread; a local one woul
 int main(void) {
     double x[NAME_NX] = {@X0@}, u[NAME_NU];
     int failed = 0;
-    NAME_init(&workspace);
+    NAME_init(&workspace@FIRST@);
     for (int period = 0; period < @EXAMPLE@; period++) {
-        int status = NAME_step(&workspace, x, NAME_STAGES, INFINITY, u);
+        int status = NAME_step(&workspace, x, @MOVED@, INFINITY, u);
         printf("%2d: status %d, %2d iterations, u", period, status, workspace.iterations);
         for (int j = 0; j < NAME_NU; j++) printf(" % .6f", u[j]);
         printf("\n");

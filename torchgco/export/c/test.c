@@ -11,9 +11,10 @@ static NAME_workspace workspace;
 int main(void) {
     double u[NAME_NU], worst = 0;
     int same = 0, close = 0;
-    NAME_init(&workspace);
     for (int k = 0; k < PERIODS; k++) {
-        int status = NAME_step(&workspace, states + k * NAME_NX, k ? NAME_STAGES : 0, INFINITY, u), equal = 1;
+        int first = @IS_FIRST@, equal = 1;
+        if (first) NAME_init(&workspace@ELEMENT@);
+        int status = NAME_step(&workspace, states + k * NAME_NX, first ? 0 : @ELAPSED@, INFINITY, u);
         for (int j = 0; j < NAME_NU; j++) {
             double away = fabs(u[j] - controls[k * NAME_NU + j]);
             equal &= away <= near[j];

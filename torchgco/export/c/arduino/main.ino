@@ -17,7 +17,7 @@ static double seconds() { /* micros begins again at 0 after 72 minutes */
 
 void setup() {
     Serial.begin(115200);
-    NAME_init(&workspace);
+    NAME_init(&workspace@FIRST@);
     workspace.clock = seconds;
     due = millis();
 }
@@ -27,7 +27,7 @@ void loop() {
     if ((long)(millis() - due) < 0) return;
     due += @MILLISECONDS@;
     double u[NAME_NU];
-    int status = NAME_step(&workspace, x, NAME_STAGES, limit, u);
+    int status = NAME_step(&workspace, x, @MOVED@, limit, u);
     limit = 0.8 * @DT@;
     Serial.print(workspace.held ? "held, status " : "status ");
     Serial.print(status);
