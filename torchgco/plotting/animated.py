@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.animation import FuncAnimation
+from matplotlib.animation import FuncAnimation, writers
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
+from PIL import Image
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.animation import PALE
@@ -36,6 +38,18 @@ class Film(FuncAnimation):
         self.at = at
         pause = 1000 * float(times[-1]) / (len(times) - 1)
         super().__init__(figure, at, frames=times.tolist(), interval=pause, cache_frame_data=False)
+
+    def save(self, filename: Any, writer: Any = None, *args: Any, **options: Any) -> None:
+        """As of matplotlib's FuncAnimation.
+
+        Raises:
+            InputError: a film that ffmpeg would have to make, where there is none.
+        """
+        Image.init()
+        form = Image.registered_extensions().get(Path(filename).suffix.lower())
+        if writer is None and form not in Image.SAVE_ALL and not writers.is_available("ffmpeg"):
+            raise InputError("filename", "a name.gif, as ffmpeg, which makes other films, isn't installed", filename)
+        super().save(filename, writer, *args, **options)
 
     def _repr_html_(self) -> str:
         return self.to_jshtml()
