@@ -63,8 +63,13 @@ def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) 
     return film_of([Leg.of(problem, solution, b)], b)
 
 
-def film_of(legs: Sequence[Leg], b: int | Sequence[int]) -> Film:
+def film_of(legs: Sequence[Leg], b: int | Sequence[int], radii: Sequence[float] | None = None) -> Film:
     """The film of all legs, one after the other, each among its own obstacles.
+
+    Args:
+        legs: with the same trajectories.
+        b: as given to `torchgco.animate`.
+        radii: of balls that are drawn as the vehicles of these trajectories, m; None: bodies, or the problem's ball.
 
     Raises:
         InputError: see `torchgco.animate`.
@@ -101,7 +106,8 @@ def film_of(legs: Sequence[Leg], b: int | Sequence[int]) -> Film:
             for place in range(len(legs[0].courses)):
                 at = _present(legs, place, t)
                 for i in range(at + 1):
-                    shown.extend(_vehicle(ax, scenes[i].world, legs[i].courses[place], plane, t, i == at))
+                    radius = None if radii is None else radii[place]
+                    shown.extend(_vehicle(ax, scenes[i].world, legs[i].courses[place], plane, t, i == at, radius))
         return shown
 
     return Film(figure, show, times)
@@ -156,20 +162,22 @@ def _moving(ax: Axes, world: World, plane: Plane, t: float) -> list[Artist]:
     return drawn
 
 
-def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float, is_there: bool) -> list[Artist]:
-    """A trajectory up to t, s, and the vehicle, where it is there: its body, or a ball of its radius."""
-    past, drawn = course.t <= t, list[Artist]()
+def _vehicle(
+    ax: Axes, world: World, course: Course, plane: Plane, t: float, is_there: bool, radius: float | None
+) -> list[Artist]:
+    """A trajectory up to t, s, and the vehicle, where it is there: a ball of this radius, its body, or its own ball."""
+    past, drawn, body = course.t <= t, list[Artist](), world.body if radius is None else None
     for path in course.paths:
         now = np.array([np.interp(t, course.t, path[:, i]) for i in plane])
         way = np.concatenate((path[past][:, plane], now[None]))
         drawn += ax.plot(*way.T, color=course.colour, linewidth=1.4, zorder=7)
-        if world.body is None and is_there:
-            radius = world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
-            drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
-    if world.body is not None and is_there:
+        if body is None and is_there:
+            size = radius or world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
+            drawn.append(ax.add_patch(Circle((now[0], now[1]), size, color=course.colour, zorder=8)))
+    if body is not None and is_there:
         state = np.array([[np.interp(t, course.t, component) for component in course.X.T]])
         if not np.isfinite(state).all():
             return drawn
         look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}
-        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in silhouettes(world.body, state, plane)]
+        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in silhouettes(body, state, plane)]
     return drawn

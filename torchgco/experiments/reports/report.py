@@ -147,8 +147,8 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure], dpi: int = 150) -> None:
-    path = folder / "figures" / _file_name(name)
-    write(path, lambda file: save(figure(), file, dpi=300 if name == "study.png" else dpi, form=path.suffix[1:]))
+    path, ending = folder / "figures" / _file_name(name), "pdf" if name.endswith(".pdf") else "png"
+    write(path, lambda file: save(figure(), file, dpi=300 if name == "study.png" else dpi, form=ending))
 
 
 def _file_name(drawing: str) -> str:
