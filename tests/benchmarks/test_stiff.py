@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from benchmarks.families.stiff import CASES, HEAD, compiling, row
+from benchmarks.lib import RESULTS
 
 
 def test_drift_is_the_largest_departure_from_the_length_of_the_rod():
@@ -21,6 +22,11 @@ def test_a_row_says_how_far_the_rod_drifts_and_what_was_compiled(monkeypatch):
     assert 0.0 < float(cells["drift"]) < 1e-8  # of index 2, positions are kept on the circle to rounding
     index_1 = dict(zip(HEAD, row("pendulum, index 1", CASES["pendulum, index 1"], "radau5", False), strict=True))
     assert float(cells["drift"]) < float(index_1["drift"]) < 1e-5
+
+
+def test_the_page_has_the_columns_that_the_command_writes():
+    text = (RESULTS / "stiff.md").read_text()
+    assert f"| {' | '.join(HEAD)} |" in text
 
 
 @pytest.mark.slow  # compiles with the default flags
