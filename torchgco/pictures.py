@@ -45,7 +45,7 @@ def plot(
         InputError: a place that isn't there, or a solution of other problems.
     """
     if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
-        return _fleet_figure(problem, solution, b)
+        return _of_fleet("fleet_figure", problem, solution, b)
     if isinstance(problem, Phases) or isinstance(solution, PhasesSolution):
         return _phases_figure(problem, solution, b)
     problem = current_problem(problem)
@@ -73,12 +73,12 @@ def _phases_of(phases: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[
     return solution.problems, solution.parts, begins.cpu().numpy(), solution.cost.cpu().numpy()
 
 
-def _fleet_figure(fleet: Any, solution: Any, b: Any) -> Figure:
-    from torchgco.plotting.fleets import fleet_figure  # matplotlib takes a second to load
+def _of_fleet(picture: str, fleet: Any, solution: Any, b: Any) -> Any:
+    from torchgco.plotting import fleets  # matplotlib takes a second to load
 
     _fleet_of(fleet, solution)
     members, X, U, distances = solution.arrays()
-    return fleet_figure(members, X, U, distances, b)
+    return getattr(fleets, picture)(members, X, U, distances, b)
 
 
 def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[Solution]]:
@@ -88,17 +88,20 @@ def _fleet_of(fleet: Any, solution: Any) -> tuple[Sequence[Problem], Sequence[So
 
 
 def animate(
-    problem: Problem | Phases, solution: Solution | PhasesSolution, b: int | Sequence[int] = 0
+    problem: Problem | Fleet | Phases,
+    solution: Solution | FleetSolution | PhasesSolution,
+    b: int | Sequence[int] = 0,
 ) -> FuncAnimation:
     """A film of trajectories among obstacles, also those that move, at 20 pictures a second in real time.
 
     A notebook plays it; `.save("way.gif")` writes it, and where ffmpeg is installed `.save("way.mp4")`. In space from
     above and from the side. Flights of over 12 s are shown faster. Of phases all of them one after the other, each with
-    its own body, among its own obstacles; a jump is an instant.
+    its own body, among its own obstacles; a jump is an instant. Of a fleet all vehicles, as discs half as wide as what
+    they keep from each other.
 
     Args:
         problem, solution: as solved.
-        b: the place of a problem in the batch, or several among the same obstacles.
+        b: the place of a problem or a fleet in the batch, or of several problems among the same obstacles.
 
     Raises:
         InputError: a place that isn't there, a solution of other problems, other obstacles, or dynamics without a
@@ -107,6 +110,8 @@ def animate(
     from torchgco.plotting.animated import film_of, solution_film  # matplotlib takes a second to load
     from torchgco.plotting.problems import legs_of
 
+    if isinstance(problem, Fleet) or isinstance(solution, FleetSolution):
+        return _of_fleet("fleet_film", problem, solution, b)
     if isinstance(problem, Phases) or isinstance(solution, PhasesSolution):
         return film_of(legs_of(*_phases_of(problem, solution), b), b)
     return solution_film(current_problem(problem), solution.detach(), b)

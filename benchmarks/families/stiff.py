@@ -1,12 +1,15 @@
 """python -m benchmarks.families.stiff: stiff models and algebraic equations by implicit steps, beside IPOPT.
 
 The models are those that the literature tries stiff integrators on. What a plan says is compared with its controls
-flown by SciPy's Radau at 1e-9. Times are processor time of one thread; IPOPT's is its own, by collocation.
+flown by SciPy's Radau at 1e-9. Times are processor time of one thread; IPOPT's is its own, by collocation. What a first
+solve compiles is measured in a process of its own, with an empty cache folder and the default flags.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -19,16 +22,18 @@ from torch import Tensor
 
 import torchgco
 from benchmarks.lib.command import Command
-from benchmarks.lib.page import markdown
+from benchmarks.lib.page import markdown, shown
+from benchmarks.speed.first_use import started
 from torchgco import ControlBounds, FunctionDynamics, InteriorPoint, Problem, QuadraticCost, Solution
 from torchgco.baselines import CasADiSolver
 
 HEAD = (
-    "model", "steps", "status", "iterations", "cost said", "cost flown", "off, %", "ms", "us an iteration",
-    "IPOPT: iterations", "its cost", "its ms",
+    "model", "steps", "status", "iterations", "cost said", "cost flown", "off, %", "drift", "ms", "us an iteration",
+    "compiles, s", "IPOPT: iterations", "its cost", "its ms",
 )  # fmt: skip
 METHODS = "rk4", "implicit_euler", "radau3", "radau5"
 STARTS = 32  # of which times are taken
+FIRST = "from benchmarks.families.stiff import first_solve; first_solve({!r}, {!r})"
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,14 @@ class Case:
                 return np.nan
             x = torch.tensor(end.y[:, -1])[None]
         return total + float(cost.terminal(x))
+
+    def guess_for(self, problem: Problem) -> Tensor:
+        """Of controls, (B, N, 1)."""
+        return torch.full((problem.B, problem.N, 1), self.guess, dtype=torch.float64)
+
+    def drift(self, X: Tensor) -> float:
+        """By how much of its length the rod of a pendulum is longer or shorter along states X (N+1, 4), at most."""
+        return float((X[:, :2].norm(dim=-1) - 1.0).abs().max()) if self.algebraic else np.nan
 
 
 def van_der_pol(x: Tensor, u: Tensor, stiffness: float) -> Tensor:
@@ -163,25 +176,41 @@ def milliseconds(work: Callable[[], Solution]) -> tuple[float, Solution]:
     return min(took), solution
 
 
+def solved(case: Case, problem: Problem) -> Solution:
+    """The case's problem, solved by the interior point from its guess, with all checks."""
+    return torchgco.solve(problem, case.guess_for(problem), solver="interior_point", verbose=False)
+
+
+def compiling(name: str, method: str) -> float:
+    """Processor time of the compilers of a first solve, in a process and with a cache folder of its own, s."""
+    with tempfile.TemporaryDirectory() as folder:
+        return float(started(["-c", FIRST.format(name, method)], {"TORCHGCO_CACHE": folder, "TORCHGCO_CFLAGS": ""}))
+
+
+def first_solve(name: str, method: str) -> None:
+    """Solve a case, and print the processor time of the compilers that have ended, s."""
+    solved(CASES[name], CASES[name].problem(method))
+    took = os.times()
+    print(took.children_user + took.children_system)
+
+
 def row(name: str, case: Case, method: str, peer: bool) -> list[str]:
     """A case by one method."""
     problem, many = case.problem(method), case.problem(method, STARTS)
-    guess = lambda p: torch.full((p.B, p.N, 1), case.guess, dtype=torch.float64)
-    solve = lambda: torchgco.solve(problem, guess(problem), solver="interior_point", verbose=False)
-    took, solution = milliseconds(solve)
-    every, batch = milliseconds(lambda: InteriorPoint().solve(many, guess(many)))
+    took, solution = milliseconds(lambda: solved(case, problem))
+    every, batch = milliseconds(lambda: InteriorPoint().solve(many, case.guess_for(many)))
     said, flown = float(solution.cost), np.nan
     if not case.algebraic and np.isfinite(said):
         flown = case.flown(problem, solution.U[0])
     off = f"{100 * abs(said / flown - 1):.2g}" if np.isfinite(flown) else "-"
     each = 1e3 * every / int(batch.iterations.sum())
     cells = [name, method, solution.statuses[0].name, f"{int(solution.iterations)}", f"{said:.6g}", f"{flown:.6g}", off]
-    cells += [f"{took:.1f}", f"{each:.1f}"]
+    cells += [shown(case.drift(solution.X[0]), ".1e"), f"{took:.1f}", f"{each:.1f}", f"{compiling(name, method):.1f}"]
     if not peer:
         return [*cells, "-", "-", "-"]
     prepared = CasADiSolver("ipopt").prepare(problem)
     timed = Timed(prepared.function)
-    found = replace(prepared, function=timed).solve(problem, guess(problem))
+    found = replace(prepared, function=timed).solve(problem, case.guess_for(problem))
     theirs = 1e3 * timed.took
     return [*cells, f"{int(found.iterations)}", f"{float(found.cost):.6g}", f"{theirs:.1f}"]
 

@@ -40,17 +40,17 @@ MODELS = {
 
 def run(bench: Bench) -> None:
     for module in ("torchgco", "torch"):
-        times = [float(_started(["-c", IMPORT.format(module)], {})) for _ in range(IMPORTS)]
+        times = [float(started(["-c", IMPORT.format(module)], {})) for _ in range(IMPORTS)]
         bench.row(SECTION, f"import {module}", "python", "seconds", median(times), "s")
     for name in list(MODELS)[: bench.sizes.models]:
         with tempfile.TemporaryDirectory() as folder:
             for cache in ("empty", "full"):
-                found = json.loads(_started(["-m", "benchmarks.speed.first_use", name], {"TORCHGCO_CACHE": folder}))
+                found = json.loads(started(["-m", "benchmarks.speed.first_use", name], {"TORCHGCO_CACHE": folder}))
                 for quantity, seconds in found.items():
                     bench.row(SECTION, f"{name}, cache {cache}", "torchgco.solve", quantity, seconds, "s")
 
 
-def _started(words: list[str], environment: dict[str, str]) -> str:
+def started(words: list[str], environment: dict[str, str]) -> str:
     """The last line that a new Python process prints.
 
     Raises:

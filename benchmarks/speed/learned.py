@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 import torchgco
-from benchmarks.speed.first_use import _started, _took
+from benchmarks.speed.first_use import _took, started
 from torchgco import ControlBounds, FunctionConstraint, FunctionDynamics, InputError, Problem, QuadraticCost, Spheres
 
 if TYPE_CHECKING:
@@ -104,10 +104,10 @@ def first_solve(bench: Bench, name: str) -> None:
     """In a new process: nothing compiled before; then only another model with as many dimensions of space."""
     other = "line in the plane" if MODELS[name]().position is not None else "line"
     with tempfile.TemporaryDirectory() as empty, tempfile.TemporaryDirectory() as built:
-        _started(["-m", "benchmarks.speed.learned", other], {"TORCHGCO_CACHE": built})
+        started(["-m", "benchmarks.speed.learned", other], {"TORCHGCO_CACHE": built})
         for case, folder in (("nothing built", empty), ("solver's objects built", built)):
             processor, wall = map(
-                float, _started(["-m", "benchmarks.speed.learned", name], {"TORCHGCO_CACHE": folder}).split()
+                float, started(["-m", "benchmarks.speed.learned", name], {"TORCHGCO_CACHE": folder}).split()
             )
             bench.row(SECTION, name, "torchgco.solve", f"first solve, {case}", processor, "s")
             bench.row(SECTION, name, "torchgco.solve", f"{case}, wall", wall, "s")

@@ -24,7 +24,7 @@ import torchgco
 from benchmarks.lib.command import Command
 from benchmarks.lib.families import FAMILIES
 from benchmarks.lib.page import markdown
-from benchmarks.speed.first_use import _started as started
+from benchmarks.speed.first_use import started
 from benchmarks.speed.loop import rates
 from torchgco import Bicycle, ControlBounds, FunctionCost, FunctionDynamics, Planar, Problem, QuadraticCost, Spheres
 from torchgco.baselines import CasADiSolver

@@ -53,7 +53,7 @@ def few_processes(monkeypatch) -> None:
     def started(words: list[str], environment: dict[str, str]) -> str:
         return "1.5" if words[0] == "-c" else json.dumps(first_use.measure(words[-1]))
 
-    monkeypatch.setattr(first_use, "_started", started)
+    monkeypatch.setattr(first_use, "started", started)
     monkeypatch.setattr(cores, "_started", lambda bench, threads: cores.measure(1, bench.sizes))
 
 

@@ -165,7 +165,7 @@ def test_metrics_belong_to_a_study_and_reports_join_studies_with_and_without(run
     ("+study.metrics.a=own_parts.words", "study.metrics.a: expected numbers (2,)"),
     ("+study.metrics.a=own_parts.nothing", "a: expected a number of each trajectory, got NaN on layout 0"),
     ("+study.metrics.a=own_parts.fails", "study.metrics.a: expected a function of (X, U, t, problem)"),
-    ("+study.metrics.a=own_parts.none", "study.metrics.a._target_: expected a class that Python can import"),
+    ("+study.metrics.a=own_parts.none", "study.metrics.a: expected a function that Python can import"),
     ("+study.metrics.a=3", "study.metrics.a: expected text, got 3"),
     ("study.metrics=3", "study.metrics: expected functions by name"),
     ("study.metrics.way.scal=2", "scal"),

@@ -250,6 +250,27 @@ def test_deadlines_are_missed_by_missions_that_fly_alone(seed: int) -> None:
         assert pages == [str(n) if batch == 1 else None for n in missed]
 
 
+def test_figures_of_earlier_reports_go(tmp_path: Path) -> None:
+    folder = study(tmp_path, *flights("gco", HITS))
+    write_report(folder)
+    kept = folder / "figures" / "my-rates.png"
+    kept.write_bytes(b"")
+    (folder / "figures" / "rates-scenario.radius.png").write_bytes(b"")
+    write_report(folder, pdf=True)
+    names = {path.name for path in (folder / "figures").iterdir()}
+    assert "rates.pdf" in names and kept.name in names and not {"rates.png", "rates-scenario.radius.png"} & names
+    before = sorted((folder / "figures").iterdir())
+    write_report(folder, figures=False)
+    assert sorted((folder / "figures").iterdir()) == before
+
+
+def test_a_table_for_latex_fits_the_line_and_has_a_legend() -> None:
+    parts = parts_of(trials({"layout": 0}, {"layout": 1}))
+    text, plain_text = (format_report(parts, form) for form in ("latex", "markdown"))
+    assert text.count("\\resizebox{") == text.count("\\begin{tabular}") == text.count("\\end{tabular}}") == 1
+    assert r"95 \% Wilson interval" in text.split("\\end{tabular}")[-1] and "footnotesize" not in plain_text
+
+
 @pytest.mark.parametrize("form", ["csv", "json", "markdown", "latex"])
 def test_missions_are_in_every_format(form: str) -> None:
     text = format_report(parts_of(trials(*flights("gco", HITS), *missions("gco", "RRCT"))), form)

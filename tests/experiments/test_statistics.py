@@ -84,6 +84,13 @@ def test_a_missing_effort_is_not_averaged_away() -> None:
     assert row["outer_iterations_median"] == 10 and row["guided_median"] == 2 and row["seconds_median"] == 0.1
 
 
+def test_times_are_of_the_trials_that_have_one() -> None:
+    row = only(summarise(trials({"seconds": 0.1}, {"layout": 1, "seconds": nan}, {"layout": 2, "seconds": 0.3})))
+    assert (row["seconds_median"], row["seconds_n"]) == (0.2, 2)
+    row = only(summarise(trials({"seconds": nan})))
+    assert isnan(row["seconds_median"]) and row["seconds_n"] == 0
+
+
 def test_all_seeds_of_a_group_are_named() -> None:
     assert only(summarise(trials({"seed": 3}, {"seed": 0})))["seed"] == "3 0"
 

@@ -91,6 +91,24 @@ def test_tables_that_count_the_rows_are_counted_again(name: str, out, capsys) ->
     assert f"not confirmed: {path}, which is missing" in text and f"rows of {name}" not in text
 
 
+def test_columns_of_another_version_are_named_and_the_others_judged(out, capsys) -> None:
+    path = out / "summary.csv"
+    kept = pd.read_csv(path)
+    other = kept.drop(columns=["clear_95_count", "success_rate"]).assign(of_old=1.0)
+    other = other[[*reversed(other.columns)]]
+    other.to_csv(path, index=False)
+    assert main(["--verify", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    names = "lacks newer columns: success_rate, clear_95_count; older ones aren't confirmed: of_old"
+    assert f"of another version: {path} ({names})" in lines and "2 rows of summary.csv confirmed" in lines
+    assert main(["--verify", str(out), "--format", "csv"]) == 0
+    row = pd.read_csv(io.StringIO(capsys.readouterr().out), keep_default_na=False).iloc[1]
+    assert row["unconfirmed"] == "of_old" and "reached_count" in row["confirmed"].split()
+    other.assign(reached_count=other["reached_count"] + 1).to_csv(path, index=False)
+    assert main(["--verify", str(out)]) == 1
+    assert f"{path}: 2 values differ in 2 rows" in capsys.readouterr().out
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("form", mostly(["csv", "json", "markdown", "latex"], "markdown", "latex"))
 def test_the_formats_give_what_was_confirmed_and_what_was_not(form: str, out, flown, capsys) -> None:

@@ -240,6 +240,25 @@ def test_a_baseline_that_equals_the_solver_flies_once(run, tmp_path) -> None:
     assert pd.read_parquet(tmp_path / "out" / "trials.parquet")["solver"].tolist() == ["hold"] * 4
 
 
+@pytest.mark.usefixtures("without_report")
+def test_a_baseline_has_the_name_that_its_file_gives(run, tmp_path) -> None:
+    (tmp_path / "mine" / "solver").mkdir(parents=True)
+    for file, of in (("one", "hold"), ("two", "al_ilqr")):
+        (tmp_path / "mine" / "solver" / f"{file}.yaml").write_text(f"defaults: [{of}]\nname: swift\n")
+    words = ["--config-dir", "mine", *commands.changed(HOLD, "hydra.run.dir=out", "study.baselines=[one]")]
+    code, _, err = run(*words)
+    assert code == 0, err
+    assert set(pd.read_parquet(tmp_path / "out" / "trials.parquet")["solver"]) == {"hold", "swift"}
+    code, _, err = run(*commands.changed(words, "study.baselines=[one,two]", "hydra.run.dir=again"))
+    assert code == 2 and "study.baselines: expected solvers with a `name` each, got several swift" in problem_line(err)
+
+
+def test_a_missing_folder_of_configurations_is_named(run, tmp_path) -> None:
+    code, _, err = run("--config-dir", "nowhere", *HOLD)
+    line = f"--config-dir: expected a folder of configurations, got {tmp_path / 'nowhere'}, which doesn't exist"
+    assert code == 2 and line in problem_line(err)
+
+
 def arrays(path: Path, **changes) -> None:
     np.savez(path, **({"centers": np.zeros((2, 3, 2)), "radii": np.full((2, 3), 0.1)} | changes))
 

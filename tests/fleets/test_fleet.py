@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.patches import Circle
 from torch import Tensor
 
 import torchgco
@@ -207,8 +208,22 @@ def test_a_figure_has_a_colour_for_each_vehicle() -> None:
     head, first = part(html, "head"), part(html, "part-0")
     assert [one["name"] for one in head["solvers"]] == ["vehicle 0", "vehicle 1", "vehicle 2"]
     assert len({one["colour"] for one in head["solvers"]}) == 3 and len(first["flights"]) == 3
-    with pytest.raises(InputError, match="b: expected the place of a fleet, 0 to 0"):
-        torchgco.plot(fleet, found, 1)
+    for picture in (torchgco.plot, torchgco.animate):
+        with pytest.raises(InputError, match="b: expected the place of a fleet, 0 to 0"):
+            picture(fleet, found, 1)
+
+
+def test_a_film_shows_all_vehicles_where_they_are_then() -> None:
+    fleet = Fleet(swaps(3), apart=0.4)
+    plans = Plans.at_rest(fleet)
+    verdict = judge_fleet(fleet, plans.U)
+    found = torchgco.fleets.FleetSolution(fleet, plans.solutions(fleet, verdict), verdict)
+    film: Any = torchgco.animate(fleet, found)
+    discs = [one for one in film.at(0.0) if isinstance(one, Circle)]
+    assert len(discs) == 3 and len({one.get_facecolor() for one in discs}) == 3
+    starts = [member.x0[0, member.position].tolist() for member in fleet.members]
+    np.testing.assert_allclose(sorted(one.get_center() for one in discs), sorted(map(tuple, starts)), atol=1e-12)
+    assert [one.get_radius() for one in discs] == pytest.approx([0.2] * 3)
 
 
 def one_of(**changes: Any) -> Problem:

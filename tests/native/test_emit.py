@@ -6,6 +6,7 @@ import pytest
 
 from tests.native.lanes import Emitted
 from tests.slow import mostly
+from torchgco.native.codegen import emit as emitting
 from torchgco.native.codegen.emit import emit, literal
 from torchgco.native.compiler import find_compiler
 from torchgco.tracing.operations import to_single
@@ -166,3 +167,28 @@ def test_literals() -> None:
     for value in (0.1, -3.0, 1e-310, 0.0, -0.0):
         assert float.fromhex(literal(value)).hex() == value.hex()
     assert [literal(v) for v in (inf, -inf, nan)] == ["INFINITY", "-INFINITY", "NAN"]
+
+
+def chained(steps: int) -> ca.Function:
+    """A step again and again: values of the first ones are read by the last ones."""
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
+    z, early = x, []
+    for _ in range(steps):
+        z = ca.vertcat(z[1] * y[0] + ca.sin(z[0]), z[2] - 0.3 * z[0] * z[0], ca.fabs(z[0]) / (1.0 + z[1] * z[1]) + y[1])
+        early.append(z[2])
+    return ca.Function("made", [x, y], [z, ca.vertcat(*early) * z[0]])
+
+
+@pytest.mark.parametrize("piece", [1, 7, 40])
+def test_a_long_function_in_pieces_has_the_bits_of_the_whole(piece: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    draws = np.random.default_rng(4)
+    x, y, function = draws.normal(size=(11, 3)), draws.normal(size=(11, 2)), chained(12)
+    whole = emit("tgco_made", function)
+    monkeypatch.setattr(emitting, "LONG", 50)
+    monkeypatch.setattr(emitting, "PIECE", piece)
+    cut = emit("tgco_made", function)
+    assert "kept" not in whole and cut.count("tgco_made_piece_") == 2 * -(-whole.count(" = ") // piece)
+    results = [Emitted(code, "tgco_made", [3, 2], [3, 12])(x, y) for code in (whole, cut)]
+    for a, b in zip(*results, strict=True):
+        assert np.isfinite(a).all()
+        np.testing.assert_array_equal(a, b)

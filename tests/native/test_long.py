@@ -8,9 +8,12 @@ import casadi
 import pytest
 import torch
 
-from torchgco import FunctionCost, FunctionDynamics, Problem
+from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, Problem, QuadraticCost
+from torchgco.native.codegen import knot
 from torchgco.native.codegen.cost import spans_of_cost
-from torchgco.native.codegen.knot import _knots
+from torchgco.native.codegen.knot import Span
+from torchgco.native.codegen.source import INTERIOR
+from torchgco.native.engine import Engine
 
 
 def problem(N: int) -> Problem:
@@ -32,7 +35,24 @@ def test_a_knot_reads_its_own_numbers_alone(N: int, monkeypatch: pytest.MonkeyPa
 
     span = spans_of_cost(problem(N))[0]
     monkeypatch.setattr(casadi, "Function", noted)
-    (knot,), places = _knots(span)
-    assert knot.numbers.numel() == 3 and len({tuple(place) for place in places}) == N
+    (single,), places = span.forms
+    assert single.numbers.numel() == 3 and len({tuple(place) for place in places}) == N
     assert len({at for place in places for at in place}) == 3 * N
     assert len(made) >= N and max(function.nnz_in() for function in made) <= 9
+
+
+def test_code_of_values_and_of_curvatures_replays_a_function_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replaying a function at all knots is what takes long."""
+    replays: list[Span] = []
+
+    def noted(span: Span) -> Any:
+        replays.append(span)
+        return forms(span)
+
+    forms = knot._forms
+    monkeypatch.setattr(knot, "_forms", noted)
+    within = FunctionConstraint(lambda x: (x * x).sum(-1, keepdim=True) - 4.0)
+    cost = QuadraticCost([1.0], [0.1, 0.1], [1.0])
+    engine = Engine(Problem(problem(5).dynamics, cost, [within], [0.0], 5), compiles=False)
+    engine.form.units(INTERIOR)
+    assert len(replays) == 1

@@ -117,6 +117,17 @@ def test_a_body_is_where_it_is_then(seed: int) -> None:
         assert np.linalg.norm(outline[:, None] - corners, axis=-1).min(0).max() < 2e-3
 
 
+def test_a_film_that_needs_ffmpeg_says_so_where_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("matplotlib.animation.writers.is_available", lambda name: name == "pillow")
+    film = torchgco.animate(problem(), torchgco.solve(problem(), solver="al_ilqr", verbose=False))
+    with pytest.raises(
+        InputError, match=r"filename: expected a name\.gif, as ffmpeg, .* isn't installed, got .*way\.mp4"
+    ):
+        film.save(tmp_path / "way.mp4")
+    film.save(str(tmp_path / "way.gif"))
+    assert [path.name for path in tmp_path.iterdir()] == ["way.gif"]
+
+
 def test_wrong_calls_are_told() -> None:
     stated = problem(MOVING)
     solution = torchgco.solve(stated, solver="hold", verbose=False)

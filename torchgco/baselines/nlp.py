@@ -20,9 +20,9 @@ from torchgco.base.errors import InputError
 from torchgco.base.tree import PerElement, apart
 from torchgco.constraints.bounds import LOOSE
 from torchgco.dynamics.base import IMPLICIT
-from torchgco.native.codegen.dynamics import elements
 from torchgco.problem.problem import Problem
 from torchgco.tracing import Traced, own_tensors
+from torchgco.tracing.arrays import elements
 from torchgco.tracing.nets import Call
 
 

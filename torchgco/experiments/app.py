@@ -51,8 +51,9 @@ def _described(_root_: Any) -> str:
     config = plain(OmegaConf.masked_copy(_root_, [str(key) for key in _root_ if key != "hydra"]))
     solvers = {config["solver"]["name"]: settings_of(config)}
     recompose = recomposer(_root_.hydra.overrides.task, _root_.hydra.runtime.config_sources)
-    for name in config["study"]["baselines"] or ():
-        solvers.setdefault(name, settings_of(recompose(name)))
+    for option in config["study"]["baselines"] or ():
+        baseline = recompose(option)
+        solvers.setdefault(baseline["solver"]["name"], settings_of(baseline))
     path = config["scenario"].get("path")
     scenario = Path(path).stem if path else config["scenario"]["name"]
     described = [VERSION, config["seed"], config["study"]["layouts"], decisive(config, solvers)]

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.animation import FuncAnimation
+from matplotlib.animation import FuncAnimation, writers
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
+from PIL import Image
 
 from torchgco.base.errors import InputError
 from torchgco.plotting.animation import PALE
@@ -37,6 +39,18 @@ class Film(FuncAnimation):
         pause = 1000 * float(times[-1]) / (len(times) - 1)
         super().__init__(figure, at, frames=times.tolist(), interval=pause, cache_frame_data=False)
 
+    def save(self, filename: Any, writer: Any = None, *args: Any, **options: Any) -> None:
+        """As of matplotlib's FuncAnimation.
+
+        Raises:
+            InputError: a film that ffmpeg would have to make, where there is none.
+        """
+        Image.init()
+        form = Image.registered_extensions().get(Path(filename).suffix.lower())
+        if writer is None and form not in Image.SAVE_ALL and not writers.is_available("ffmpeg"):
+            raise InputError("filename", "a name.gif, as ffmpeg, which makes other films, isn't installed", filename)
+        super().save(filename, writer, *args, **options)
+
     def _repr_html_(self) -> str:
         return self.to_jshtml()
 
@@ -49,8 +63,13 @@ def solution_film(problem: Problem, solution: Solution, b: int | Sequence[int]) 
     return film_of([Leg.of(problem, solution, b)], b)
 
 
-def film_of(legs: Sequence[Leg], b: int | Sequence[int]) -> Film:
+def film_of(legs: Sequence[Leg], b: int | Sequence[int], radii: Sequence[float] | None = None) -> Film:
     """The film of all legs, one after the other, each among its own obstacles.
+
+    Args:
+        legs: with the same trajectories.
+        b: as given to `torchgco.animate`.
+        radii: of balls that are drawn as the vehicles of these trajectories, m; None: bodies, or the problem's ball.
 
     Raises:
         InputError: see `torchgco.animate`.
@@ -87,7 +106,8 @@ def film_of(legs: Sequence[Leg], b: int | Sequence[int]) -> Film:
             for place in range(len(legs[0].courses)):
                 at = _present(legs, place, t)
                 for i in range(at + 1):
-                    shown.extend(_vehicle(ax, scenes[i].world, legs[i].courses[place], plane, t, i == at))
+                    radius = None if radii is None else radii[place]
+                    shown.extend(_vehicle(ax, scenes[i].world, legs[i].courses[place], plane, t, i == at, radius))
         return shown
 
     return Film(figure, show, times)
@@ -142,20 +162,22 @@ def _moving(ax: Axes, world: World, plane: Plane, t: float) -> list[Artist]:
     return drawn
 
 
-def _vehicle(ax: Axes, world: World, course: Course, plane: Plane, t: float, is_there: bool) -> list[Artist]:
-    """A trajectory up to t, s, and the vehicle, where it is there: its body, or a ball of its radius."""
-    past, drawn = course.way.t <= t, list[Artist]()
+def _vehicle(
+    ax: Axes, world: World, course: Course, plane: Plane, t: float, is_there: bool, radius: float | None
+) -> list[Artist]:
+    """A trajectory up to t, s, and the vehicle, where it is there: a ball of this radius, its body, or its own ball."""
+    past, drawn, body = course.way.t <= t, list[Artist](), world.body if radius is None else None
     for path in course.way.paths:
         now = np.array([np.interp(t, course.way.t, path[:, i]) for i in plane])
         way = np.concatenate((path[past][:, plane], now[None]))
         drawn += ax.plot(*way.T, color=course.colour, linewidth=1.4, zorder=7)
-        if world.body is None and is_there:
-            radius = world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
-            drawn.append(ax.add_patch(Circle((now[0], now[1]), radius, color=course.colour, zorder=8)))
-    if world.body is not None and is_there:
+        if body is None and is_there:
+            size = radius or world.first.margin or 0.01 * float(np.ptp(ax.get_xlim()))
+            drawn.append(ax.add_patch(Circle((now[0], now[1]), size, color=course.colour, zorder=8)))
+    if body is not None and is_there:
         state = np.array([[np.interp(t, course.way.t, component) for component in course.way.X.T]])
         if not np.isfinite(state).all():
             return drawn
         look: dict[str, Any] = {"facecolor": (*to_rgb(course.colour), 0.4), "edgecolor": course.colour, "zorder": 8}
-        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in world.body.outlines(state, plane)]
+        drawn += [ax.add_patch(Polygon(outline, **look)) for outline in body.outlines(state, plane)]
     return drawn

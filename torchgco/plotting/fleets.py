@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from torchgco.base.errors import InputError
+from torchgco.plotting.animated import Film, film_of
 from torchgco.plotting.animation import PALE, frames_of, write_gif
 from torchgco.plotting.bodies import ABOVE, SIDE
-from torchgco.plotting.problems import TALLEST_SCENE, WIDTH, Course, SceneMap
+from torchgco.plotting.problems import TALLEST_SCENE, WIDTH, Course, Leg, SceneMap
 from torchgco.plotting.style import INK, PALETTE, SMALL, NotebookFigure, tidy
 from torchgco.plotting.trajectory import LIMIT
 from torchgco.plotting.ways import ways_along
@@ -37,10 +38,7 @@ def fleet_figure(
         X, U: (B, N+1, n) and (B, N, m) of each.
         distances: (V, V), m, that pairs keep; 0 of those that keep none.
     """
-    b = 0 if b is None else b
-    if not isinstance(b, int) or isinstance(b, bool) or not 0 <= b < members[0].B:
-        raise InputError("b", f"the place of a fleet, 0 to {members[0].B - 1}", b)
-    drawn = _scene(members, X, U, b)
+    drawn = _scene(members, X, U, _place(members, b))
     courses, planes, high = drawn.courses, drawn.planes, drawn.height(WIDTH)
     figure = NotebookFigure(figsize=(WIDTH, min(high, TALLEST_SCENE * len(planes)) + LOWER), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, LOWER))[:, 0]
@@ -48,6 +46,21 @@ def fleet_figure(
     _ends(upper.axes, members, drawn)
     _distances(lower.subplots(), courses[0].t, [course.paths[0] for course in courses], distances)
     return figure
+
+
+def fleet_film(
+    members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.ndarray], distances: np.ndarray, b: Any
+) -> Film:
+    """The film of `torchgco.animate` for fleet b, of discs half as wide as what the vehicles keep."""
+    drawn = _scene(members, X, U, _place(members, b))
+    return film_of([Leg(members[0], drawn.courses, "s")], b, (0.5 * distances.max(axis=1)).tolist())
+
+
+def _place(members: Sequence[Problem], b: Any) -> int:
+    b = 0 if b is None else b
+    if not isinstance(b, int) or isinstance(b, bool) or not 0 <= b < members[0].B:
+        raise InputError("b", f"the place of a fleet, 0 to {members[0].B - 1}", b)
+    return b
 
 
 def fleet_animation(

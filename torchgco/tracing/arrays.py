@@ -24,6 +24,16 @@ def boxed(value: Any) -> np.ndarray:
     return box
 
 
+def elements(column: Any) -> np.ndarray:
+    """The scalars of a column of CasADi's, (size,) objects."""
+    import casadi as ca
+
+    scalars = np.empty(column.numel(), dtype=object)
+    for i, element in enumerate(ca.vertsplit(column)):
+        scalars[i] = element
+    return scalars
+
+
 def axes(a: np.ndarray, dim: int | Sequence[int] | None) -> tuple[int, ...]:
     """The axes that `dim` means, counted from the front; None and [] are all of them."""
     chosen = range(a.ndim) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim

@@ -22,6 +22,7 @@ from torchgco.tracing import arrays
 from torchgco.tracing.arrays import NoCounterpart, boxed
 
 Scalar = Callable | str  # a function of scalars, or the name of CasADi's
+FEW = 8  # expressions that take as long in columns as one after the other
 
 
 @functools.cache
@@ -33,12 +34,39 @@ def _casadi() -> Any:
 
 def _elementwise(function: Scalar, inputs: int) -> Callable:
     """`function` of scalars, on arrays that are broadcast to one shape."""
-    of_scalars = lambda: getattr(_casadi(), function) if isinstance(function, str) else function
-    over = functools.cache(lambda: np.frompyfunc(of_scalars(), inputs, 1))
-    return lambda *arrays: boxed(over()(*arrays))
+    return lambda *arrays: boxed(_over(function, inputs)(*arrays))
 
 
-_unary, _binary = (functools.partial(_elementwise, inputs=inputs) for inputs in (1, 2))
+@functools.cache
+def _over(function: Scalar, inputs: int) -> np.ufunc:
+    """`function` of scalars, one element after the other."""
+    return np.frompyfunc(getattr(_casadi(), function) if isinstance(function, str) else function, inputs, 1)
+
+
+def _columnwise(function: Scalar, inputs: int) -> Callable:
+    """The same of a function that CasADi computes of whole columns, too, in a quarter of the time for each element."""
+
+    def over(*operands: Any) -> np.ndarray:
+        same = [np.asarray(a, dtype=object) for a in np.broadcast_arrays(*map(boxed, operands))]
+        symbolic = _symbolic(*same)
+        if np.count_nonzero(symbolic) < FEW:
+            return boxed(_over(function, inputs)(*operands))
+        result = np.empty(symbolic.shape, dtype=object)
+        result[~symbolic] = _over(function, inputs)(*(a[~symbolic] for a in same))
+        of_columns = getattr(_casadi(), function) if isinstance(function, str) else function
+        result[symbolic] = arrays.elements(of_columns(*(_casadi().vertcat(*a[symbolic]) for a in same)))
+        return result
+
+    return over
+
+
+def _symbolic(*operands: np.ndarray) -> np.ndarray:
+    """Where one of some arrays of one shape has an expression."""
+    is_symbolic = np.frompyfunc(lambda element: isinstance(element, _casadi().SX), 1, 1)
+    return functools.reduce(np.logical_or, (np.asarray(is_symbolic(a), dtype=bool) for a in operands))
+
+
+_unary, _binary = (functools.partial(_columnwise, inputs=inputs) for inputs in (1, 2))
 
 
 def _choose(condition: Any, a: Any, b: Any) -> Any:
@@ -64,7 +92,7 @@ def _comparison(compare: Callable) -> Callable:
             return result
         return compare(_itself(a), b) if isinstance(a, _casadi().SX) else compare(a, _itself(b))
 
-    return _binary(compared)
+    return _elementwise(compared, 2)
 
 
 _where = _elementwise(_choose, 3)
@@ -85,7 +113,7 @@ def _raise(a: Any, b: Any) -> Any:
     return _choose(a == 0.0, at_zero, power)
 
 
-_power = _binary(_raise)
+_power = _elementwise(_raise, 2)
 _sqrt = _unary("sqrt")
 _fmin, _fmax = _binary("fmin"), _binary("fmax")  # in C, NaN where one of the two is
 
@@ -127,7 +155,8 @@ def _clamp(a: Any, min: Any = None, max: Any = None) -> np.ndarray:
         if bound is not None:
             flat = not isinstance(bound, np.ndarray) and _flat_at_numbers()
             outside = (reached if flat else beyond)(a, bound)
-            a = _where(_binary(_either)(outside, _ne(bound, bound)), bound, a)  # a bound that is NaN is the result
+            is_result = _elementwise(_either, 2)(outside, _ne(bound, bound))  # a bound that is NaN, too
+            a = _where(is_result, bound, a)
     return a
 
 
@@ -280,7 +309,7 @@ def wrapped(element: Any, low: int, size: int) -> Any:
 
 def _truths(reduce: Callable) -> Callable:
     """A reduction whose result is 0 or 1 where it takes over a single element, too."""
-    return lambda *args, **options: _unary(to_truth)(reduce(*args, **options))
+    return lambda *args, **options: _elementwise(to_truth, 1)(reduce(*args, **options))
 
 
 def _refused(*_: Any, **__: Any) -> Any:

@@ -162,6 +162,8 @@ def as_input_error(error: BaseException, field: str = "configuration") -> InputE
     if isinstance(error, MissingConfigException) and options:
         group, _, option = str(error.missing_cfg_file).rpartition("/")
         return InputError(group, f"one of {', '.join(options)}", option)
+    if folder := re.match(r"Additional config directory '(.+)' not found", str(error)):
+        return InputError("--config-dir", "a folder of configurations", f"{folder[1]}, which doesn't exist")
     text = "\n".join((str(error), *getattr(error, "__notes__", ())))
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if unknown := re.match(r"Could not override '(.+?)'", lines[0] if lines else ""):
@@ -192,8 +194,8 @@ def _not_found(error: BaseException, key: str, target: str) -> InputError:
     while (cause := reason.__cause__ or reason.__context__) is not None:
         reason = cause
     why = f"{target} ({type(reason).__name__}: {_joined(reason)})"
-    expected = "a class that Python can import (PYTHONPATH=. for a module of this folder)"
-    return InputError(f"{key}._target_", expected, why)
+    kind, at = ("function", key) if key.startswith("study.metrics.") else ("class", f"{key}._target_")
+    return InputError(at, f"a {kind} that Python can import (PYTHONPATH=. for a module of this folder)", why)
 
 
 def _unknown_key(error: BaseException, key: str) -> InputError:

@@ -293,11 +293,14 @@ def _rivals(configuration: dict[str, Any], recompose: Recompose) -> dict[str, di
     """The configurations of the solvers by name, the one under study first; a baseline that equals it is left out."""
     studied = configuration["solver"]["name"]
     rivals = {studied: configuration}
-    for name in configuration["study"]["baselines"] or ():
-        other = recompose(name)
-        here, there = settings_of(configuration), settings_of(other)
-        if name == studied and digest(here) != digest(there):
-            expected = f"another name, as the baseline {studied} has other settings: solver.name={studied}_changed"
+    for option in configuration["study"]["baselines"] or ():
+        other = recompose(option)
+        name = other["solver"]["name"]
+        here, there = settings_of(rivals.get(name, other)), settings_of(other)
+        if digest(here) != digest(there):
+            if name != studied:
+                raise InputError("study.baselines", "solvers with a `name` each", f"several {name}")
+            expected = f"another name, as the baseline {option} has other settings: solver.name={studied}_changed"
             raise InputError("solver.name", expected, f"{studied} ({difference(there, here)})")
         rivals.setdefault(name, other)
     return rivals

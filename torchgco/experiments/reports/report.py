@@ -7,6 +7,7 @@ run, and reports on all of them together.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -64,6 +65,7 @@ from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
 SHOWN_LAYOUTS = 12  # layouts in a picture, at most
+OURS = re.compile(r"(rates|outcomes)(-.+)?|(missions-)?(clearance|violation)")  # names of what `drawings` draws
 FACETS = 6  # most tasks that have panels of their own; more are pooled over the swept variables
 Arrays = Mapping[str, np.ndarray]
 
@@ -113,7 +115,16 @@ def write_report(
     if pdf:
         to_draw = {name if name.startswith("study.") else f"{name}.pdf": figure for name, figure in to_draw.items()}
     draw({name: partial(_draw, folder, name, figure) for name, figure in to_draw.items()})
+    if figures:
+        _forget(folder / "figures", {_file_name(name) for name in to_draw})
     return format_report(parts, form)
+
+
+def _forget(figures: Path, drawn: set[str]) -> None:
+    """Remove what earlier reports drew and this one doesn't: it would be read as one of this report's figures."""
+    for path in figures.glob("*.p*"):
+        if path.suffix in (".png", ".pdf") and OURS.fullmatch(path.stem) and path.name not in drawn:
+            path.unlink(missing_ok=True)
 
 
 def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any]]:
@@ -137,9 +148,12 @@ def _posed(layouts: Layouts, tasks: Tasks | None) -> tuple[Arrays, dict[str, Any
 
 
 def _draw(folder: Path, name: str, figure: Callable[[], Figure], dpi: int = 150) -> None:
-    ending = "pdf" if name.endswith(".pdf") else "png"
-    path = folder / "figures" / f"{name.removesuffix(f'.{ending}')}.{ending}"
+    path, ending = folder / "figures" / _file_name(name), "pdf" if name.endswith(".pdf") else "png"
     write(path, lambda file: save(figure(), file, dpi=300 if name == "study.png" else dpi, form=ending))
+
+
+def _file_name(drawing: str) -> str:
+    return drawing if drawing.endswith((".png", ".pdf")) else f"{drawing}.png"
 
 
 def drawings(part: Part) -> Drawings:

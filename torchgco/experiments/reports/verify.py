@@ -66,6 +66,7 @@ class Table:
         rows: of the table.
         columns: that were computed again and compared.
         others: its other columns, which only the checksum of the file guards, if anything.
+        lacking: columns that it would have today: it is of an older version.
         differences: names of the row (solver and layout), column, held and computed, in the order of the table; no
             rows: all columns are confirmed.
     """
@@ -75,6 +76,7 @@ class Table:
     columns: tuple[str, ...]
     others: tuple[str, ...]
     differences: pd.DataFrame
+    lacking: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -171,14 +173,21 @@ def _counted(folder: Path, trials: pd.DataFrame) -> tuple[list[Table], tuple[str
 
 
 def _compared(name: str, stored: pd.DataFrame, computed: pd.DataFrame, keys: pd.Index) -> Table:
-    """A table of which all columns are computed again, row by row; `keys` name a row."""
-    if list(stored.columns) != list(computed.columns) or len(stored) != len(computed):
+    """A table of which all columns are computed again, row by row; `keys` name a row.
+
+    Columns that one of both has alone are of another version.
+    """
+    both = [column for column in computed.columns if column in stored.columns]
+    lacking, others = (
+        tuple(a.columns.difference(b.columns, False)) for a, b in ((computed, stored), (stored, computed))
+    )
+    if len(stored) != len(computed):
         shapes = (f"{len(frame)} rows, {len(frame.columns)} columns" for frame in (stored, computed))
         differences = pd.DataFrame([("-", "-", *shapes)], columns=["row", "column", "held", "computed"])
     else:
         index = pd.MultiIndex.from_frame(computed[keys.intersection(computed.columns)])
-        differences = _differences(stored.set_axis(index), computed.set_axis(index))
-    return Table(name, len(computed), tuple(computed.columns), (), differences)
+        differences = _differences(stored[both].set_axis(index), computed[both].set_axis(index))
+    return Table(name, len(computed), tuple(both), others, differences, lacking)
 
 
 def _identity(study: Study, index: pd.MultiIndex) -> pd.DataFrame:
@@ -291,10 +300,20 @@ def confirmed_text(studies: Sequence[Verification]) -> str:
             lines.append(f"{rows} of {'missions' if kind else 'trajectories'}:")
         lines += list(dict.fromkeys(f"  {line}" for study in of_kind for line in _columns(study)))
     for name in (VEHICLES, "summary.csv", "paired.csv"):
-        counted = [table.rows for study in right for table in study.tables if table.name == name]
-        lines += [f"{_rows(counted)} of {name} confirmed"] if counted else []
+        rows = [table.rows for study in right for table in study.tables if table.name == name]
+        lines += [f"{_rows(rows)} of {name} confirmed"] if rows else []
     lines += [f"not confirmed: {study.folder / name}, which is missing" for study in right for name in study.absent]
+    lines += [
+        _version_text(study, table) for study in right for table in study.tables[1:] if table.lacking + table.others
+    ]
     return "\n".join(lines)
+
+
+def _version_text(study: Verification, table: Table) -> str:
+    """What of a table is of another version."""
+    words = ("lacks newer columns", table.lacking), ("older ones aren't confirmed", table.others)
+    said = "; ".join(f"{word}: {', '.join(names)}" for word, names in words if names)
+    return f"of another version: {study.folder / table.name} ({said})"
 
 
 def _rows(counts: Iterable[int]) -> str:
@@ -320,7 +339,8 @@ def confirmed_frame(studies: Sequence[Verification]) -> pd.DataFrame:
         for table in study.tables:
             names = _sorted(study, table)
             cells = {kind: " ".join(named) for kind, named in names.items()}
-            cells |= {} if any(named for kind, named in names.items() if kind != "confirmed") else {"confirmed": "all"}
+            whole = not table.lacking and not any(named for kind, named in names.items() if kind != "confirmed")
+            cells |= {"confirmed": "all"} if whole else {}
             first = {"study": str(study.folder), "file": table.name, "rows": table.rows}
             rows.append({**first, "differing": len(table.differences), **cells})
         empty = dict.fromkeys(("confirmed", "by_outcome", "checksum", "unconfirmed"), "")
@@ -333,7 +353,7 @@ def _sorted(study: Verification, table: Table) -> dict[str, list[str]]:
     """The columns of a table by how far they are confirmed."""
     trials = table is study.tables[0]
     bound = BY_OUTCOME if study.missions and trials else ()
-    unknown = NOT_LOGGED if study.missions and trials else ()
+    unknown = (NOT_LOGGED if study.missions else ()) if trials else table.others  # a checksum guards trials alone
     return {
         "confirmed": [name for name in table.columns if name not in bound],
         "by_outcome": [name for name in table.columns if name in bound],

@@ -233,7 +233,8 @@ def format_report(parts: Sequence[Part], form: str) -> str:
     Formats:
         csv: the summary with all its columns.
         json: all columns of both tables, under "summary" and "paired"; null where a number is undefined.
-        markdown, latex: the columns that a paper prints, of both tables, for each kind.
+        markdown, latex: the columns that a paper prints, of both tables, for each kind; in LaTeX at most as wide as a
+            line, above a legend.
         table: as `Kind.text`.
     """
     if form == "table":
@@ -243,10 +244,17 @@ def format_report(parts: Sequence[Part], form: str) -> str:
         if form == "csv":
             return format_frame(tables["summary"], form)
         return json.dumps({name: json.loads(format_frame(table, form)) for name, table in tables.items()}, indent=1)
-    tables = [table for part in parts for table in part.kind.printed(part.summary, part.paired)]
-    return "\n\n".join(format_frame(table, form) for table in tables)
+    texts = []
+    for part in parts:
+        tables = [format_frame(table, form) for table in part.kind.printed(part.summary, part.paired)]
+        texts += [FITTED.replace("TABLE", table) for table in tables] if form == "latex" else tables
+        legend = "; ".join(part.kind.notes.splitlines()).replace("%", r"\%")
+        texts += [rf"{{\footnotesize {legend}\par}}"] if form == "latex" else []
+    return "\n\n".join(texts)
 
 
+# Of a table in LaTeX: by graphicx, as wide as it is or as a line, whichever is less.
+FITTED = r"\noindent\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%" + "\nTABLE}"
 QUANTILES = [f"{name}_{suffix}" for name in ("cost_ratio", *EFFORT) for suffix in ("median", "p90")]
 OF_TRAJECTORIES = (
     *(f"{name}_rate" for name in (*OUTCOMES, PAPER_OUTCOME)), "cost_median_reached", "cost_median", "violation_median",

@@ -90,8 +90,9 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
         cost_median: over the cost_n trials whose cost is finite.
         cost_ratio_median, _p90: cost divided by the best known cost, over the cost_ratio_n trials that reached the goal
             and have a positive best cost.
-        <effort>_median, _p90: iterations, outer_iterations, guided and seconds over the trials with a valid start; nan
-            if one of them lacks the number.
+        <effort>_median, _p90: iterations, outer_iterations and guided over the trials with a valid start; nan if one of
+            them lacks the number.
+        seconds_median, _p90: over the seconds_n trials with a valid start of which the time is known.
         makespan_median, _p90: of fleets that reached their goals.
         status_<NAME>: trials that ended with this status; missions: with this outcome.
         threads, device, kernels: what they were solved on, as text.
@@ -152,8 +153,10 @@ class _Values:
             "cost_ratio_n": len(ratio),
             **_quantiles("cost_ratio", ratio),
         }
-        for name in EFFORT:
+        for name in EFFORT[:-1]:
             row |= _quantiles(name, selected[name][valid])
+        timed = selected["seconds"][valid & ~np.isnan(selected["seconds"])]  # others' solvers don't say all times
+        row |= {**_quantiles("seconds", timed), "seconds_n": len(timed)}
         if MAKESPAN in selected:
             row |= _quantiles(MAKESPAN, selected[MAKESPAN][reached])
         counts = np.bincount(self.status[rows], minlength=len(self.statuses)).tolist()

@@ -132,7 +132,9 @@ def _curves(name: str, inputs: list[Any], total: Any, tangents: calls.Ahead | No
     entries = calls.emit_staged(f"{name}_entries", inputs, outputs, stages)
     written, places = f"out{len(outputs) - 1}", [i * size + j for i, j, _ in upper]
     # They are added where they are found: an array of all of them would be half of a step's stack.
-    end = entries.rindex(f"static inline void {name}_entries")  # stages before it have outputs of their own
+    # The functions that write the outputs: stages before them have outputs of their own.
+    begin = re.search(rf"^[\w ]+ void {name}_entries(_end)?(_piece_\d+)?\(", entries, re.MULTILINE)
+    end = begin.start() if begin else 0
     added = re.sub(rf"\b{written}\[(\d+)\] =", lambda at: f"{written}[{places[int(at[1])]}] +=", entries[end:])
     head, call = f"TGCO_APART void {name}({arguments}, OUT H) {{", f"    {name}_entries({passed}, H);"
     return "\n".join([entries[:end] + added, head, call, "}"])

@@ -19,6 +19,7 @@ from torchgco.native import store
 from torchgco.native.codegen import calls, emit, layers, roots
 from torchgco.tracing import Traced, arrays, dtypes, nets, operations, own_tensors
 from torchgco.tracing import roots as traced_roots
+from torchgco.tracing.arrays import elements
 from torchgco.tracing.nets import Call
 
 RATIONAL = "INPUT", "OUTPUT", "CONST", "PARAMETER", "ASSIGN", "ADD", "SUB", "MUL", "DIV", "INV", "NEG", "TWICE", "SQ"
@@ -176,16 +177,6 @@ def computed_entries(jacobian: Any, lists: Mapping[str, Sequence[Any]]) -> Any:
 
     where = zip(lists["rows"], lists["columns"], lists["places"], strict=True)
     return ca.densify(ca.vertcat(ca.SX(0, 1), *(jacobian[i, j] for i, j, place in where if place >= 0)))
-
-
-def elements(column: Any) -> np.ndarray:
-    """The scalars of a column, (size,) objects."""
-    import casadi as ca
-
-    elements = np.empty(column.numel(), dtype=object)
-    for i, element in enumerate(ca.vertsplit(column)):
-        elements[i] = element
-    return elements
 
 
 @cache

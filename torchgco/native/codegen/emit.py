@@ -10,8 +10,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from torchgco.base.errors import InputError
 
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
     import casadi as ca
 
 MOST_LINES = 150_000  # compiled in some three minutes
+LONG, PIECE = 2000, 500  # statements of a function that is cut into pieces, and of each of these, about
 # Functions of functions.h, on each lane.
 _OF_ONE = (
     "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh",
@@ -50,11 +55,47 @@ def emit(name: str, function: ca.Function, shared: int | None = None) -> str:
         raise ValueError(f"{name}: expected a CasADi function of scalar expressions, got {function.class_name()}")
     arguments = [f"{input_type(i, shared)} in{i}" for i in range(function.n_in())]
     arguments += [f"OUT ALONE out{i}" for i in range(function.n_out())]
-    lines, size = _statements(function, shared)
-    work = ", ".join(f"w{i}" for i in range(size))
-    declared = [f"V {work};"] if work else []
-    body = "\n".join(f"    {line}" for line in (*declared, *lines))
-    return f"static inline void {name}({', '.join(arguments)}) {{\n{body}\n}}\n"
+    statements, size = _statements(function, shared)
+    head = f"static inline void {name}({', '.join(arguments)}) {{"
+    if len(statements) <= LONG:
+        return "\n".join([head, "\n".join(_body(statements, range(size))), "}\n"])
+    pieces = _pieces(name, arguments, statements, size)
+    passed = ", ".join(argument.split()[-1] for argument in arguments)
+    calls = (f"    {name}_piece_{i}({passed}, kept);" for i in range(len(pieces)))
+    return "\n".join([*pieces, head, f"    V kept[{size}];", *calls, "}\n"])
+
+
+def _body(statements: Sequence[_Statement], variables: Iterable[int]) -> list[str]:
+    work = ", ".join(f"w{i}" for i in variables)
+    return [f"    {line}" for line in (*([f"V {work};"] if work else []), *(each.text for each in statements))]
+
+
+def _pieces(name: str, arguments: Sequence[str], statements: Sequence[_Statement], size: int) -> list[str]:
+    """Functions of some statements each, in order; variables that later ones read are kept in an array between them.
+
+    To find registers for a function, gcc takes a time that grows faster than its length.
+    """
+    edges = np.linspace(0, len(statements), 1 + math.ceil(len(statements) / PIECE)).astype(int)
+    spans = [statements[a:b] for a, b in pairwise(edges)]
+    reads, live, pieces = [_read_first(span) for span in spans], set[int](), list[str]()
+    for i in reversed(range(len(spans))):
+        made = {each.writes for each in spans[i] if each.writes is not None}
+        text = [f"TGCO_APART void {name}_piece_{i}({', '.join(arguments)}, OUT ALONE kept) {{"]
+        loads = [_Statement(f"w{j} = kept[{j}];") for j in sorted(reads[i])]
+        text += _body([*loads, *spans[i]], sorted(made | reads[i]))
+        text += [f"    kept[{j}] = w{j};" for j in sorted(made & live)]
+        pieces.append("\n".join([*text, "}"]))
+        live = reads[i] | live - made
+    return pieces[::-1]
+
+
+def _read_first(statements: Sequence[_Statement]) -> set[int]:
+    """The variables that are read before they are written."""
+    read, written = set[int](), set[int | None]()
+    for each in statements:
+        read |= {variable for variable in each.reads if variable not in written}
+        written.add(each.writes)
+    return read
 
 
 def function(name: str, inputs: Sequence[Any], *outputs: Any) -> str:
@@ -81,29 +122,39 @@ def checked(field: str, code: str) -> str:
     return code
 
 
-def _statements(function: ca.Function, shared: int | None) -> tuple[list[str], int]:
-    """A line for each instruction but for products that a sum takes, and how many variables w these lines have."""
+@dataclass(frozen=True)
+class _Statement:
+    """A line of C, the numbers of the variables w that it reads, and of that which it writes; None: an output."""
+
+    text: str
+    reads: Sequence[int] = ()
+    writes: int | None = None
+
+
+def _statements(function: ca.Function, shared: int | None) -> tuple[list[_Statement], int]:
+    """One for each instruction but for products that a sum takes, and how many variables w they have."""
     operations, reads = instructions(function)
     sums = _sums(operations, reads)
     taken = {product for product, *_ in sums.values()}
     needs = [list(sums[k][2]) if k in sums else read for k, read in enumerate(reads)]
     last = {read: k for k, read_by in enumerate(needs) if k not in taken for read in read_by}
-    lines, names, free, size = [], {}, [], 0
+    lines, variables, free, size = list[_Statement](), dict[int, int](), list[int](), 0
     for k, read in enumerate(needs):
         if k in taken:
             continue
-        operands = [names[j] for j in read]
-        free += [names.pop(j) for j in dict.fromkeys(read) if last[j] == k]
+        of = [variables[j] for j in read]
+        operands = [f"w{variable}" for variable in of]
+        free += [variables.pop(j) for j in dict.fromkeys(read) if last[j] == k]
         if operations[k] == codes()["OUTPUT"]:
             output, entry = function.instruction_output(k)
-            lines.append(f"out{output}[{entry}] = {operands[0]};")
+            lines.append(_Statement(f"out{output}[{entry}] = {operands[0]};", of))
             continue
         value = sums[k][1].format(*operands) if k in sums else _value(function, k, operands, shared)
         if not free:
-            free.append(f"w{size}")
+            free.append(size)
             size += 1
-        names[k] = free.pop()
-        lines.append(f"{names[k]} = {value};")
+        variables[k] = free.pop()
+        lines.append(_Statement(f"w{variables[k]} = {value};", of, variables[k]))
     return lines, size
 
 

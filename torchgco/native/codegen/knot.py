@@ -21,8 +21,9 @@ from torchgco.base.errors import InputError
 from torchgco.native import store
 from torchgco.native.codegen import emit
 from torchgco.native.codegen.calls import key_of
-from torchgco.native.codegen.dynamics import elements, makers
+from torchgco.native.codegen.dynamics import makers
 from torchgco.tracing import Traced
+from torchgco.tracing.arrays import elements
 from torchgco.tracing.nets import Call
 
 
@@ -36,6 +37,14 @@ class Span:
     states: int
     controls: int
     knots: Sequence[int]
+
+    @cached_property
+    def forms(self) -> tuple[list[Knot], list[list[int]]]:
+        """The knots of the function, one for each form, and the places (K|1, count) of each knot's numbers.
+
+        Found once: the code of values and slopes and that of second derivatives are made of them.
+        """
+        return _knots(self)
 
 
 @dataclass(frozen=True)
@@ -141,7 +150,7 @@ def knot_parts(
     shape = str((span.n, span.m, span.states, span.controls, list(span.knots)))
 
     def make() -> dict[str, Any]:
-        knots, places = _knots(span)
+        knots, places = span.forms
         form: list[Any] = [span.n, span.m]
         for knot in knots:
             form += [*_form(_whole(knot))[0], *(key_of(call.net) for call in knot.calls)]
@@ -199,7 +208,7 @@ class _Form:
 
 
 def _knots(span: Span) -> tuple[list[Knot], list[list[int]]]:
-    """The knots of a function, one for each form, and the places (K|1, count) of each knot's numbers."""
+    """See `Span.forms`."""
     import casadi as ca
 
     traced, forms = span.traced, _forms(span)
