@@ -133,9 +133,9 @@ def test_elements_of_every_kind_have_the_bits_of_python(kind: str, tmp_path: Pat
 
 
 def copy_iterate(c: LoadedController, kept: Any, b: int) -> None:
-    for name, values in (("x", kept.X), ("u", kept.U), *((f"lam_{i}", lam) for i, lam in enumerate(kept.lam))):
-        if values.numel() > 0:
-            getattr(c.workspace, name)[:] = values[b].flatten().tolist()
+    lam = torch.cat([part[b].flatten() for part in kept.lam])
+    for name, values in (("x", kept.X[b]), ("u", kept.U[b]), ("lam", lam)):
+        getattr(c.workspace, name)[:] = values.flatten().tolist()
 
 
 def test_elements_are_those_of_problems_alone(folder: Path, tmp_path: Path) -> None:

@@ -36,9 +36,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def begin_alike(c: LoadedController, compiled: Any) -> None:
     """Give C the iterate of Python: the first solve of a free time is a search there, and from a plan here."""
     kept, w = compiled._kept, c.workspace
-    for name, values in (("x", kept.X), ("u", kept.U), *((f"lam_{i}", lam) for i, lam in enumerate(kept.lam))):
-        if values.numel() > 0:
-            getattr(w, name)[:] = values.flatten().tolist()
+    lam = torch.cat([part.flatten() for part in kept.lam])
+    for name, values in (("x", kept.X), ("u", kept.U), ("lam", lam)):
+        getattr(w, name)[:] = values.flatten().tolist()
     w.able = w.begun = 1
 
 
