@@ -35,7 +35,7 @@ class Film(FuncAnimation):
     """An animation that notebooks play; `at(t)` draws an instant, s, and returns what it has drawn."""
 
     def __init__(self, figure: Figure, at: Callable[[float], list[Artist]], times: np.ndarray) -> None:
-        self.at = at
+        self.at, self.figure = at, figure
         pause = 1000 * float(times[-1]) / (len(times) - 1)
         super().__init__(figure, at, frames=times.tolist(), interval=pause, cache_frame_data=False)
 

@@ -53,7 +53,9 @@ def fleet_film(
 ) -> Film:
     """The film of `torchgco.animate` for fleet b, of discs half as wide as what the vehicles keep."""
     drawn = _scene(members, X, U, _place(members, b))
-    return film_of([Leg(members[0], drawn.courses, "s")], b, (0.5 * distances.max(axis=1)).tolist())
+    film = film_of([Leg(members[0], drawn.courses, "s")], b, (0.5 * distances.max(axis=1)).tolist())
+    _ends(film.figure.axes, members, drawn)
+    return film
 
 
 def _place(members: Sequence[Problem], b: Any) -> int:
