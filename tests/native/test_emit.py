@@ -188,6 +188,7 @@ def test_a_long_function_in_pieces_has_the_bits_of_the_whole(piece: int, monkeyp
     monkeypatch.setattr(emitting, "PIECE", piece)
     cut = emit("tgco_made", function)
     assert "kept" not in whole and cut.count("tgco_made_piece_") == 2 * -(-whole.count(" = ") // piece)
+    assert emitting.whole(f"{cut}{whole}") == whole + whole
     results = [Emitted(code, "tgco_made", [3, 2], [3, 12])(x, y) for code in (whole, cut)]
     for a, b in zip(*results, strict=True):
         assert np.isfinite(a).all()

@@ -89,6 +89,24 @@ def _pieces(name: str, arguments: Sequence[str], statements: Sequence[_Statement
     return pieces[::-1]
 
 
+def whole(code: str) -> str:
+    """The code with functions in pieces made whole again, for small stacks: those have no room for what is kept."""
+    lines, body, inside = list[str](), list[str](), False
+    for line in code.split("\n"):
+        if line.startswith("TGCO_APART") and "_piece_" in line:
+            inside = True
+        elif inside and line == "}":
+            inside = False
+        elif inside:
+            body += [] if "kept[" in line or line.startswith("    V ") else [line]
+        elif line.startswith("    V kept["):
+            lines += [*_body((), range(int(line[11:-2]))), *body]
+            body = []
+        elif not line.endswith(", kept);"):
+            lines.append(line)
+    return "\n".join(lines)
+
+
 def _read_first(statements: Sequence[_Statement]) -> set[int]:
     """The variables that are read before they are written."""
     read, written = set[int](), set[int | None]()

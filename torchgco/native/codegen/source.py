@@ -11,7 +11,7 @@ from typing import Any
 from torchgco.native.codegen.cost import CostSource
 from torchgco.native.codegen.curvature import curvature_code
 from torchgco.native.codegen.dynamics import DynamicsSource
-from torchgco.native.codegen.emit import literal, switch
+from torchgco.native.codegen.emit import literal, switch, whole
 from torchgco.native.codegen.knot import KnotSource
 from torchgco.native.compiler import Unit, lanes, neurons
 from torchgco.native.declarations import defines
@@ -125,7 +125,7 @@ class Form:
         generated = self._model_code()
         if "riccati.c" in files:
             generated.append(curvature_code(self.dynamics, self.functions))
-        texts = {"constants.h": constants(), "code.h": "\n".join(generated)}
+        texts = {"constants.h": constants(), "code.h": whole("\n".join(generated))}
         kept = {"NET_WIDTH": neurons(), "REAL": "double", "LANES": 1} | constants_of
         sizes = kept | self._sizes | _space(self.position)
         sizes["MAX_ROWS"] = max(sizes["MAX_ROWS"], sizes["DIM"])  # of places of balls, be there none
