@@ -1,9 +1,9 @@
 """What others' controllers take on the same emulated Cortex-M7: CasADi's SQP as generated C, and TinyMPC.
 
 CasADi gets the car's problem as `baselines.nlp` writes it, and makes the same periods as our controller: the first from
-a straight drive, the others from the plan before, a stage later; with the multipliers of that plan it takes hundreds of
-times as long. TinyMPC (`pip install --no-deps tinympc`, whose wheel has its
-C++ and Eigen) gets the linear quadrotor; its terminal weights follow from its penalty, so its controls aren't compared.
+a straight drive, the others from the plan before, a stage later; with the multipliers of that plan it takes far longer.
+TinyMPC (`pip install --no-deps tinympc`, whose wheel has its C++ and Eigen) gets the linear quadrotor; its terminal
+weights follow from its penalty, so its controls aren't compared.
 """
 
 from __future__ import annotations
