@@ -267,6 +267,8 @@ def _lost(part: Any, result: Any) -> Iterator[str]:
 
 def _shadowed(part: Any) -> Iterator[tuple[str, str, str]]:
     """Names of a user's class by which one of ours means something else: this class, and what it means."""
+    if _is_ours(type(part)):
+        return
     line = type(part).__mro__
     named = {name: None for cls in line if not _is_ours(cls) for name in (*vars(cls), *inspect.get_annotations(cls))}
     for name in named:
@@ -286,6 +288,8 @@ def _is_method(value: object) -> bool:
 
 def _torn(result: Any) -> Iterator[tuple[str, str, str]]:
     """A user's own method, one that is inherited from a class of ours and computes without it, and this class."""
+    if _is_ours(type(result)):
+        return
     line = type(result).__mro__
     for name in COMPUTED:
         index = next((i for i, cls in enumerate(line) if name in vars(cls)), None)
