@@ -87,6 +87,7 @@ def _stepped(compiled: Compiled, exported: Exported, x: np.ndarray, elapsed: flo
     if not is_first or plan is None:
         return compiled.call({"x0": x}, elapsed=elapsed)  # type: ignore[no-any-return]
     (X, U, t), (*firsts, last) = plan, (*user.time.segments, user.N)
+    # As C computes them, whose bits these are compared with: `in_time.factors_of` adds up stage by stage.
     ends = [*firsts[1:], last]
     lengths = user.dynamics.dt * t.new_tensor([b - a for a, b in zip(firsts, ends, strict=True)])
     factors = ((t[:, ends] - t[:, firsts]) / lengths).clamp(user.time.least, user.time.most)

@@ -153,7 +153,7 @@ class _Values:
             "cost_ratio_n": len(ratio),
             **_quantiles("cost_ratio", ratio),
         }
-        for name in EFFORT[:-1]:
+        for name in (name for name in EFFORT if name != "seconds"):
             row |= _quantiles(name, selected[name][valid])
         timed = selected["seconds"][valid & ~np.isnan(selected["seconds"])]  # others' solvers don't say all times
         row |= {**_quantiles("seconds", timed), "seconds_n": len(timed)}
