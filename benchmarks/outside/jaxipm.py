@@ -74,7 +74,7 @@ def extremes(own: pd.DataFrame, peer: pd.DataFrame) -> str:
 
 
 def is_solved(flight: pd.DataFrame) -> pd.Series:
-    """Whether instances count by the published rule: rows at the knots alone, which plans keep that touch between them."""
+    """Whether instances count by the published rule: by rows at the knots, which plans that touch between them keep."""
     return flight.converged | (flight.violation <= 100 * TOLERANCE)
 
 
