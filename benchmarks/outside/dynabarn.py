@@ -116,9 +116,13 @@ class Motion:
 
 
 def beyond(p: np.ndarray) -> np.ndarray:
-    """A place outside, straight behind the side of the yard that a place at the border lies at."""
-    side = np.abs(p) > np.abs(p).max() - 0.1
-    return p + OUTSIDE * np.sign(p) * side
+    """Where a cylinder waits whose way begins or ends at a place at the border: beyond the wall there.
+
+    On the open side, before which the robot starts, it waits beyond the nearer corner, straight along the border.
+    """
+    is_open = p[0] > 10.0 - 0.1
+    side = np.array([False, True]) if is_open else np.abs(p) > np.abs(p).max() - 0.1
+    return p + OUTSIDE * np.where(p < 0, -1.0, 1.0) * side
 
 
 def motions(world: int) -> list[Motion]:

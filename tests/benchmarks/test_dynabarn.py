@@ -100,6 +100,7 @@ def test_what_is_planned_among_covers_what_is_driven_among() -> None:
 def test_a_cylinder_waits_beyond_the_side_that_it_comes_through() -> None:
     assert beyond(np.array([-10.0, 4.0])).tolist() == [-40.0, 4.0]
     assert beyond(np.array([2.0, 10.0])).tolist() == [2.0, 40.0]
+    assert beyond(np.array([10.0, -3.0])).tolist() == [10.0, -33.0], "not through the robot's start"
 
 
 def test_runs_begin_by_world_and_seed_alone() -> None:
