@@ -71,7 +71,7 @@ def test_drawn_ends_are_free_for_the_body_of_the_vehicle(scenario: str, corners:
         assert bool(problem.start_is_clear.all())
         ends = problem.cost.x_ref[:, -1]
         assert all(bool(obstacles.start_is_clear(ends).all()) for obstacles in problem.obstacles)
-    drawn = setup.vehicle.among(compose(words + ["model=unicycle"]).scenario, range(4))
+    drawn = setup.vehicle.among(compose([*words, "model=unicycle"]).scenario, range(4))
     assert np.array_equal(drawn.layouts.start, layouts.take(range(4)).start)
 
 

@@ -16,7 +16,7 @@ from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
 
 End = Literal["start", "goal"]
-ENDS: tuple[End, End] = ("start", "goal")
+ENDS: tuple[End, ...] = ("start", "goal")
 MAX_DRAWS = 5000  # rounds of redrawing points that lie too near, before an InputError
 
 

@@ -184,5 +184,5 @@ class MapFile(Scenario):
         from scipy.ndimage import label
 
         values, spacing, vehicle = self.map.values[0], self.map.spacing, self._vehicle
-        free = {end: vehicle.free(end, values, spacing, CLEAR, spacing) for end in ENDS}
+        free: dict[End, np.ndarray] = {end: vehicle.free(end, values, spacing, CLEAR, spacing) for end in ENDS}
         return label(values > CLEAR * vehicle.inner + spacing)[0], free

@@ -177,12 +177,12 @@ class Vehicle:
         if body is None or position is None or scenario.dimension != self.dimension:
             return scenario
         nothing = Layouts(np.zeros((1, 0, self.dimension)), np.zeros((1, 0)))
-        obstacles, inner = self.task(nothing).problem.obstacles[0], body.inscribed_radius
-        if obstacles.body is None:  # a single ball at the position
+        balls, inner = self.task(nothing).problem.obstacles[0].body, body.inscribed_radius
+        if balls is None:  # a single ball at the position
             return scenario.flown_by(Footing.of_ball(inner, self.dimension))
         states = torch.tensor([list(self.start), list(self.goal)], dtype=torch.float64)
-        centers = obstacles.points.at(states.unsqueeze(0))[0] - states[:, None, position]
-        start, goal = torch.cat((centers, obstacles.radii.view(1, -1, 1).expand(2, -1, 1)), dim=-1).numpy()
+        centers = balls.points.at(states.unsqueeze(0))[0] - states[:, None, position]
+        start, goal = torch.cat((centers, balls.radii.view(1, -1, 1).expand(2, -1, 1)), dim=-1).numpy()
         return scenario.flown_by(Footing(start, goal, inner))
 
     @property

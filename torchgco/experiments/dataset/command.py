@@ -157,8 +157,7 @@ def _stored(path: Path) -> dict[str, Any]:
 
 
 def _free(folder: Path, about: Mapping[str, Any]) -> None:
-    """Leave the folder to any data set, where this one has claimed it and nothing is solved; InputError as `readable`.
-    """
+    """Leave the folder to any data set, where this one has claimed it and nothing is solved."""
     if not files_of(folder) and _stored(folder / ABOUT) == about:
         for path in (*(folder / name for name in (ABOUT, MAP, CARD)), *folder.glob("run*.json")):
             path.unlink(missing_ok=True)
