@@ -23,6 +23,7 @@ from torchgco import (
     QuadraticCost,
     Solution,
     Spheres,
+    Status,
 )
 
 
@@ -189,3 +190,36 @@ def test_wrong_guesses_are_refused_in_a_line(guesses: Any, others: dict[str, Any
     with pytest.raises(InputError) as error:
         torchgco.solve(pendulums(), guesses=guesses, **others)
     assert str(error.value).startswith(f"{field}:") and "\n" not in str(error.value)
+
+
+def movers(is_free: bool) -> Problem:
+    """Two problems of a mass on a line, in a given time or a free one."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1, "rk4", position=slice(0, 1))
+    cost = FunctionCost(lambda x, u: 0.01 * u.square().sum(-1), lambda x: 9.0 * (x[..., 0] - 2.0).square())
+    goal, time = (Goal([2.0], 0.1, required=True), FreeTime(1.0, 6.0)) if is_free else (None, None)
+    return Problem(model, cost, [ControlBounds(-2, 2)], [[0.0, 0.0], [0.5, 0.0]], 20, goal, time=time)
+
+
+@pytest.mark.sampled(4)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("solver", ["gco", "interior_point", "al_ilqr", "ipopt"])
+@pytest.mark.parametrize("is_free", [False, True])
+@pytest.mark.filterwarnings("ignore")
+def test_a_guess_that_is_not_finite_loses_its_problem_alone(is_free: bool, solver: str, value: float) -> None:
+    """In free time, and of states anywhere, it was replaced without a word, and of controls by some solvers."""
+    if is_free and solver == "al_ilqr":
+        pytest.skip("it can't choose a time")
+    problem, rest = movers(is_free), torch.zeros(2, 20, 1, dtype=torch.float64)
+    states, U, X = problem.x0.unsqueeze(1).repeat(1, 21, 1), rest.clone(), problem.x0.unsqueeze(1).repeat(1, 21, 1)
+    U[1, 3], X[1, 4, 0] = value, value
+    cases: list[tuple[dict[str, Any], dict[str, Any]]] = [({"U0": U}, {"U0": rest})]
+    if solver != "al_ilqr":
+        cases.append(({"U0": rest, "X0": X}, {"U0": rest, "X0": states}))
+    for given, finite in cases:
+        found, due = (torchgco.solve(problem, solver=solver, verbose=False, **guess) for guess in (given, finite))
+        assert found.statuses == [due.statuses[0], Status.NON_FINITE] and Status.CONVERGED in due.statuses
+        assert torch.equal(found.U[0], due.U[0]) and not bool(torch.isfinite(found.X[1]).all())
+        both = torchgco.solve(problem, solver=solver, verbose=False, guesses=[given, finite])
+        assert Status.NON_FINITE not in both.statuses and int(both.guess[1]) == 1  # type: ignore[index]
+        alone = torchgco.solve(problem, solver=solver, verbose=False, guesses=[given])
+        assert alone.statuses[1] is Status.NON_FINITE

@@ -119,7 +119,7 @@ def solve(
         max_seconds: after which the best trajectories so far are returned, of peers the guess; see `Solver.solve`.
         X0: states to begin with (B, N+1, n), such as waypoints; U0 need not lead to them. For `interior_point`, `ipopt`
             and `fatrop`, and without obstacles, or with a free time, `gco`. Default: those that U0 leads to; where the
-            time is free, those of its estimate.
+            time is free, those of its estimate. A problem whose guess isn't finite, of `warm` too, ends NON_FINITE.
         record: keep `solution.trace` and, of `gco`, `solution.search`, where the solver can: `solution.explain` then
             says more. The results are the same.
         verbose: True: a line on stdout for every row of the solver's table that worked on some problem, and one at the

@@ -140,7 +140,8 @@ def solve_guesses(
         end = replace(best, account=Account(problem, solver, kernels=kernels), **counts)
     else:
         left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
-        end = _continued(solver, problem, best, U0[chosen], seed, ids, callback, left)
+        states = None if X0 is None else X0[chosen]
+        end = _continued(solver, problem, best, (U0[chosen], states), seed, ids, callback, left)
         end = replace(end, **{name: getattr(end, name) + count for name, count in counts.items()})
     table = (getattr(found, name).view(-1, k) for name in ("cost", "violation", "status", "iterations"))
     return replace(end, guess=chosen % k, guesses=GuessRecord(*table))
@@ -163,17 +164,21 @@ def _continued(
     solver: Solver,
     problem: Problem,
     best: Solution,
-    U0: Tensor,
+    guess: tuple[Tensor, Tensor | None],
     seed: int,
     ids: Tensor | None,
     callback: Callback | None,
     max_seconds: float | None,
 ) -> Solution:
-    """What the solver makes of the best local solutions; of these, U0 (B, N, m) is the guess."""
+    """What the solver makes of the best local solutions; of these, U0 (B, N, m) and maybe X0 are the guess."""
+    U0, X0 = guess
     sound = (torch.isfinite(best.cost) & torch.isfinite(best.U).flatten(1).all(-1)).view(-1, 1, 1)
     U, X, start = torch.where(sound, best.U, U0), None, problem
     if problem.time is not None and best.times is not None:
-        start, X = guessing_times(problem, best.times), best.X
+        start, X = (
+            guessing_times(problem, best.times),
+            torch.where(sound, best.X, problem.at_rest[0] if X0 is None else X0),
+        )
     elif problem.free_start is not None:
         start = problem.guessing(torch.where(sound[:, 0], best.X[:, 0], problem.x0))
     end = solver.solve(start, U, seed, ids, None, callback, max_seconds, X)

@@ -168,6 +168,7 @@ def test_contradictory_bounds_are_infeasible(plugin: str) -> None:
 class Jerk(Constraint):
     """|u_{k+1} - u_k| <= 1 / 10: rows that join two knots."""
 
+    joins_knots: ClassVar[bool] = True
     knots: ClassVar[slice] = slice(0, 19)
 
     def bind(self, dims) -> "Jerk":
@@ -180,9 +181,9 @@ class Jerk(Constraint):
 
 def test_rows_that_join_knots_are_for_ipopt_alone() -> None:
     problem, U0 = with_constraints(Jerk())
-    assert CasADiSolver("ipopt").solve(problem, U0).statuses == [Status.CONVERGED] * 2
+    assert CasADiSolver("ipopt").prepare(problem).solve(problem, U0).statuses == [Status.CONVERGED] * 2
     with pytest.raises(InputError, match="fatrop"):
-        CasADiSolver("fatrop").solve(problem, U0)
+        CasADiSolver("fatrop").prepare(problem)
 
 
 def test_horizons_of_each_problem_are_refused() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor, inf
 import torchgco
 from tests.engines import compiled, engine_of, in_c
 from tests.native.test_engine import DAMPED, eager, natively, running_state
-from tests.native.users import Each, GaussNewton, Smooth, Tube, user_problem
+from tests.native.users import Each, GaussNewton, Tube, user_problem
 from torchgco import (
     ILQR,
     AugmentedLagrangian,
@@ -197,28 +197,6 @@ def test_rows_and_derivatives_are_those_of_autodiff() -> None:
     fx, fu = problem.dynamics.jacobians(X[:, :12], U)
     for mine, theirs in zip((fx, fu), torchgco.Dynamics.jacobians(problem.dynamics, X[:, :12], U), strict=True):
         torch.testing.assert_close(mine, theirs)
-
-
-class Sharp(Smooth):
-    """A cost with its own sum."""
-
-    def total(self, X: Tensor, U: Tensor) -> Tensor:
-        return 2.0 * super().total(X, U)
-
-    def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
-        super().expand(X, U, H)
-        H.mul_(2.0)
-
-
-def test_a_cost_keeps_its_own_sum() -> None:
-    base = user_problem(5, 12)
-    problem = Problem(base.dynamics, Sharp(), [RateBounds(-0.2, 0.2)], base.x0, 12)
-    lifted = with_carried(problem)
-    X, U = torch.randn(5, 13, 6, dtype=D), torch.randn(5, 12, 2, dtype=D)
-    torch.testing.assert_close(lifted.cost.total(X, U), problem.cost.total(X[..., :4], U))
-    assert torch.equal(lifted.cost.stage(X[:, :12], U, torch.arange(12)), problem.cost.stage(X[:, :12, :4], U, 0))
-    with pytest.warns(EagerWarning, match="cost.total"):
-        assert BRIEF.solve(problem, U).X.shape == (5, 13, 4)
 
 
 @pytest.mark.slow

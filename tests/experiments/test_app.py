@@ -223,6 +223,13 @@ def test_flags_may_stand_between_words(run) -> None:
     assert len(set(wholes)) == 1 and wholes[0][0] == 0 and "layouts: 2" in wholes[0][1]
 
 
+@pytest.mark.parametrize("kind", ["job", "hydra", "all"])
+def test_a_part_that_the_configuration_lacks_is_refused_in_one_line(kind: str, run) -> None:
+    code, out, err = run("-p", "foo", "--cfg", kind)
+    assert (code, out) == (2, "")
+    assert problem_line(err) == "torchgco: -p: expected a group or a key of the configuration, got foo"
+
+
 @pytest.mark.slow
 def test_a_reader_that_has_read_enough_is_no_error(tmp_path) -> None:
     for words in ("--shell-completion install=bash", "--help", "--version", "--cfg job"):

@@ -103,6 +103,19 @@ def test_a_stopped_one_goes_on_and_another_configuration_is_refused(tmp_path: Pa
     assert record[1]["ended"] == "finished" and record[1]["command"].startswith("torchgco-dataset ")
 
 
+def test_what_raises_before_the_first_layout_leaves_the_folder_free(tmp_path: Path, monkeypatch) -> None:
+    words = [tmp_path, *HOLD, "study.layouts=2"]
+
+    def fail(*arguments: object) -> None:
+        raise InputError("a", "b", "c")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "_fly", fail)
+        assert run(*words) == 2
+    assert list(tmp_path.iterdir()) == []
+    assert run(*words, "seed=1") == 0 and run(*words) == 2
+
+
 @pytest.mark.slow
 def test_a_damaged_file_is_named_and_redone_on_request(tmp_path: Path, capsys) -> None:
     words = [tmp_path, *HOLD, "study.layouts=4", "study.shard_size=2"]

@@ -88,6 +88,25 @@ def test_a_file_of_fleets(run, tmp_path) -> None:
     assert code == 0 and "1/1 100 %" in out, err
 
 
+def test_a_fleet_that_starts_badly_is_a_row_of_its_own(run, tmp_path) -> None:
+    """The others are solved as without it; where no fleet starts well the study says what it needs."""
+    starts = np.array([[[-2.0, 0.0], [2.0, 0.1]], [[-2.0, 0.0], [-1.8, 0.1]], [[0.0, -2.0], [0.1, 2.0]]])
+    none = {"centers": np.zeros((3, 0, 2)), "radii": np.zeros((3, 0))}
+    drawn = Layouts(**none, start=starts, goal=-starts, apart=0.4, dt=0.1, stages=60)
+    for name, rows in (("mine", [0, 1, 2]), ("bad", [1]), ("good", [0, 2])):
+        drawn.take(rows).save(tmp_path / f"{name}.npz")
+    words = ["scenario=layouts", "model=disc", "study.figures=false", "study.workers=1", "study.baselines=[]"]
+    assert run(*words, "scenario.path=mine.npz", "hydra.run.dir=mine")[0] == 0
+    assert run(*words, "scenario.path=good.npz", "hydra.run.dir=good")[0] == 0
+    trials, others = (pd.read_parquet(tmp_path / name / "trials.parquet") for name in ("mine", "good"))
+    assert trials["reached"].tolist() == [True, False, True] and others["reached"].all()
+    assert trials["status"].tolist()[1] == "INVALID_START" and not trials["feasible"][1]
+    assert trials["cost"].tolist()[::2] == others["cost"].tolist()
+    assert not verify_study(tmp_path / "mine").differs
+    code, _, err = run(*words, "scenario.path=bad.npz", "hydra.run.dir=bad")
+    assert code == 2 and "a fleet whose vehicles start outside their obstacles, and apart" in problem_line(err)
+
+
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("words", "line"),
@@ -97,7 +116,6 @@ def test_a_file_of_fleets(run, tmp_path) -> None:
         (["study.figure=two"], "study.figure: expected null for fleets, got two"),
         (["scenario.vehicles=1"], "scenario.vehicles: expected"),
         (["scenario.apart=0"], "scenario.apart: expected"),
-        (["scenario.spacing=0.01", "scenario.radius=0.1"], "fleet.vehicles: expected starts 0.4 m apart"),
         (["model=quadrotor"], "model: expected model=planar or"),
     ],
 )

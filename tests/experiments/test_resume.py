@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 import torch
 
 from tests.experiments.commands import HOLD, TINY, problem_line
-from torchgco import MultiStart
+from torchgco import InputError, MultiStart
+from torchgco.experiments.flying import study
 from torchgco.experiments.results.folder import StudyFolder
+from torchgco.experiments.results.lock import held
 from torchgco.scenarios import Layouts
 from torchgco.solvers import AugmentedLagrangian
 from torchgco.solvers.augmented_lagrangian import OuterLoop
@@ -73,6 +76,48 @@ def test_a_refused_command_leaves_the_folder_as_it_is(words, run, run_until, tmp
     code, _, err = run(*HOLD, *words, "hydra.run.dir=out")
     assert code == 2 and problem_line(err)
     assert contents(tmp_path / "out") == before
+
+
+@pytest.mark.usefixtures("without_report")
+@pytest.mark.parametrize("error", [InputError("a", "b", "c"), RuntimeError("broken"), KeyboardInterrupt()])
+def test_what_raises_before_the_first_row_leaves_the_folder_free(error, run, tmp_path, monkeypatch) -> None:
+    """A refusal that came late kept the folder for a study that had no row; one with rows keeps it."""
+    words = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"]
+
+    def fail(*arguments: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "_fly", fail)
+        with suppress(RuntimeError):
+            run(*words)
+        with suppress(RuntimeError):
+            run(*words, "study.jobs=2", "study.job=1")
+    (tmp_path / "out").mkdir(exist_ok=True)
+    assert contents(tmp_path / "out") == {}
+    assert run(*words, "seed=1")[0] == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(study.StudyFolder, "close", fail)
+        (tmp_path / "out" / "done").unlink()
+        with suppress(RuntimeError):
+            run(*words, "seed=1")
+    assert run(*words)[0] == 2 and run(*words, "seed=1")[0] == 0
+
+
+@pytest.mark.usefixtures("without_report")
+def test_a_share_that_fails_leaves_the_claim_to_the_others(run, tmp_path, monkeypatch) -> None:
+    words, jobs = [*HOLD, "study.shard_size=2", "hydra.run.dir=out"], ["study.jobs=2"]
+
+    def fail(*arguments: object) -> None:
+        raise RuntimeError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(study, "_fly", fail)
+        with held(tmp_path / "out", 0, 2), pytest.raises(RuntimeError):
+            run(*words, *jobs, "study.job=1")
+    assert (tmp_path / "out" / "study.json").is_file()
+    assert run(*words, "seed=1")[0] == 2
+    assert run(*words, *jobs, "study.job=0")[0] == 0
 
 
 @pytest.mark.slow

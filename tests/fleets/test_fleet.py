@@ -245,7 +245,6 @@ BAD: dict[str, tuple[Any, Any, str]] = {
     "pairs": ([FIRST, one_of()], {"pairs": [(0, 2)]}, r"fleet.pairs: expected pairs of two vehicles within 0..1"),
     "none": ([FIRST, one_of()], {"pairs": []}, "fleet.pairs: expected pairs of two vehicles within 0..1"),
     "twice": ([FIRST, one_of()], {"pairs": [(0, 1), (1, 0)]}, "fleet.pairs: expected .* none twice"),
-    "starts": ([FIRST, disc([0.2, 0.0], [3, 0])], {}, "expected starts 0.4 m apart, got vehicles 0 and 1 of fleet 0"),
     "single": ([FIRST, one_of().cast(torch.float32)], {}, r"vehicles\[1\].x0: expected float64 on the CPU"),
     "time": ([FIRST, replace(one_of(), time=FreeTime(3.0, 6.0))], {}, r"vehicles\[1\].time: expected None"),
 }

@@ -30,6 +30,19 @@ def test_who_starts_inside_an_obstacle_ends_the_planning_of_its_fleet() -> None:
     assert torchgco.Status(int(found.status[0])).name == "INVALID_START"
 
 
+def test_vehicles_that_touch_at_the_start_are_lost_with_their_fleet_alone() -> None:
+    members = [disc([[0, 0], [0, 0]], [[4, 0], [4, 0]]), disc([[4, 0], [0.2, 0]], [[0, 0.1], [0, 0.1]])]
+    members.append(disc([[2, 2], [2, 2]], [[2, -2], [2, -2]]))
+    found = torchgco.solve(Fleet(members, 0.4))
+    assert found.sound.tolist() == [True, False] and not bool(found.verdict.apart[1, :2].any())
+    assert torchgco.Status(int(found.status[1])).name == "INVALID_START"
+    assert [one.statuses[1].name == "INVALID_START" for one in found] == [True, True, False]
+    alone = torchgco.solve(Fleet([member.take(torch.tensor([0])) for member in members], 0.4))
+    assert all(torch.equal(mine.U[0], yours.U[0]) for mine, yours in zip(found, alone, strict=True))
+    with pytest.raises(torchgco.InputError, match="vehicles for which plans are found that keep them apart"):
+        torchgco.FleetMPC(Fleet(members, 0.4))
+
+
 def test_controls_alone_make_a_solution() -> None:
     fleet = Fleet([disc([0, 0], [4, 0]), disc([4, 0.3], [0, 0.3])], 0.2)
     found = torchgco.solve(fleet)

@@ -276,7 +276,7 @@ class Nothing(Planar):
 
 @dataclass(frozen=True)
 class OtherSum(Cost):
-    """Its own sum has a term that `stage` doesn't know, and no derivatives."""
+    """Its own sum has a term that `stage` doesn't know."""
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         return 0.1 * u.square().sum(-1)
@@ -295,7 +295,7 @@ MISSING = {
     "constraints[1].bind": lambda: problem(StateBounds(-9.0, 9.0), ReturnsNone()),
     "NoValue.value": lambda: problem(NoValue()),
     "dynamics.bind": lambda: problem(dynamics=Nothing(dt=0.05)),
-    "cost.expand": lambda: problem(cost=OtherSum()),
+    "cost.total": lambda: problem(cost=OtherSum()),
     "cost.goal": lambda: problem(cost=own(OtherSum, goal=lambda self, x0: x0 + "here")()),
 }
 

@@ -1,13 +1,25 @@
 """Functions whose rows depend on other knots, on their number, or on other problems are refused by `Problem`."""
 
+import warnings
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchgco import FunctionConstraint, FunctionCost, FunctionDynamics, InputError, Problem, QuadraticCost
+import torchgco
+from torchgco import (
+    Constraint,
+    Cost,
+    FunctionConstraint,
+    FunctionCost,
+    FunctionDynamics,
+    InputError,
+    Problem,
+    QuadraticCost,
+)
 from torchgco.native.codegen.constraint import trace_rows
 
 D = torch.float64
@@ -83,6 +95,101 @@ def test_rows_that_join_knots_are_refused(name: str) -> None:
     with pytest.raises(InputError, match=r"rows of one knot .*RateBounds.*knot_values") as caught:
         problem(constraints=[FunctionConstraint(function, of=of)])
     assert caught.value.field == "constraint.function" and "\n" not in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Rows(Constraint):
+    """The rows of a function of whole trajectories X, U at some knots."""
+
+    function: Callable[..., Tensor]
+    knots: Any = None  # all of them
+
+    def bind(self, dims: Any) -> "Rows":
+        return self if self.knots is not None else replace(self, knots=slice(0, dims.N + 1))
+
+    def value(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.function(X, U)
+
+
+STAGES, LATER = slice(0, N), slice(1, N + 1)
+# Those of single functions that join knots, whatever their number, and what only whole trajectories show.
+OF_CLASSES: dict[str, Rows] = {
+    **{name: Rows(lambda X, U, f=f: f(X)) for name, (of, f) in JOINED.items() if of == "x" and name in (
+        "first knot", "far mean", "far and negative", "one knot at another")},
+    **{name: Rows(lambda X, U, f=f: f(U), STAGES) for name, (of, f) in JOINED.items() if of == "u"},
+    "previous state": Rows(lambda X, U: X[:, 1:, 1:] - X[:, :-1, 1:] - 0.1, LATER),
+    "next state": Rows(lambda X, U: X[:, 1:, 1:] - 0.8, STAGES),
+    "previous control": Rows(lambda X, U: U - 0.1, LATER),
+    "start": Rows(lambda X, U: X[:, -1:] - X[:, :1] - 0.2, slice(N, N + 1)),
+    "turned": Rows(lambda X, U: X.flip(1) - 2.0),
+    "some knots": Rows(lambda X, U: X[:, [4, 7]] - 2.0, torch.tensor([3, 7])),
+    "a step": Rows(lambda X, U: X - 2.0 + 0.5 * (X.amax(1, keepdim=True) > 4.0)),
+}  # fmt: skip
+APART_CLASSES: dict[str, Rows] = {
+    "states": Rows(lambda X, U: X - 2.0),
+    "both": Rows(lambda X, U: X[:, :-1] * U - 2.0, STAGES),
+    "the last": Rows(lambda X, U: X[:, -1:].norm(dim=-1, keepdim=True) - 3.0, slice(N, N + 1)),
+    "some knots": Rows(lambda X, U: X[:, [7, 3]] - 2.0, torch.tensor([7, 3])),
+    "times": Rows(lambda X, U: X - torch.arange(N + 1, dtype=X.dtype)[:, None] / X.shape[1]),
+    "branch": Rows(lambda X, U: X - 2.0 if bool(X.sum() > -1e4) else X - 2.5),
+}
+
+
+@pytest.mark.parametrize("name", OF_CLASSES)
+def test_rows_of_classes_that_join_knots_are_refused(name: str) -> None:
+    """They were only warned of, and some were solved: by derivatives that leave other knots out."""
+    with pytest.raises(InputError, match=r"rows of one knot .*RateBounds.*depend on other knots") as caught:
+        problem(constraints=[OF_CLASSES[name]])
+    assert caught.value.field == "constraints[0].value" and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", APART_CLASSES)
+def test_rows_of_classes_that_keep_knots_apart_are_accepted(name: str) -> None:
+    problem(constraints=[APART_CLASSES[name]])
+
+
+@dataclass(frozen=True)
+class Summed(Cost):
+    """A cost with its own sum, that of its stages and more."""
+
+    more: Callable[[Tensor, Tensor], Tensor]
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        return u.square().sum(-1) + (x - 1.0).square().sum(-1)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        return x.square().sum(-1)
+
+    def total(self, X: Tensor, U: Tensor) -> Tensor:
+        return self.stage(X[:, :-1], U, 0).sum(-1) + self.terminal(X[:, -1]) + self.more(X, U)
+
+
+OTHER_SUMS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "changes": lambda X, U: U.diff(dim=1).square().sum((-2, -1)),
+    "twice": lambda X, U: X[:, -1].square().sum(-1),
+    "largest": lambda X, U: X.abs().amax((-2, -1)),
+    "far": lambda X, U: (X[:, 5, 0] - 30.0).relu(),
+    "negative and far": lambda X, U: (-X.sum((-2, -1)) - 900.0).relu(),
+    "one number": lambda X, U: X.sum(),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_SUMS)
+def test_an_own_sum_of_a_cost_that_is_not_that_of_its_stages_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="the sum of its stages and its terminal cost") as caught:
+        problem(cost=Summed(OTHER_SUMS[name]))
+    assert caught.value.field == "cost.total" and "\n" not in str(caught.value)
+
+
+def test_an_own_sum_of_the_stages_is_traced_as_any_other_cost() -> None:
+    """In free time, in phases and with horizons it was refused, and solved by PyTorch elsewhere."""
+    one, plain = (problem(cost=cost) for cost in (Summed(lambda X, U: 0.0), FunctionCost(
+        lambda x, u: u.square().sum(-1) + (x - 1.0).square().sum(-1), lambda x: x.square().sum(-1))))  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found, due = (torchgco.solve(made, solver="interior_point", verbose=False) for made in (one, plain))
+    torch.testing.assert_close(found.U, due.U)
+    torch.testing.assert_close(found.cost, one.cost.total(found.X, found.U))
 
 
 @pytest.mark.parametrize("name", APART)

@@ -59,6 +59,30 @@ def test_drawn_ends_are_free_connected_and_apart(tmp_path: Path) -> None:
     assert (MapFile(rooms(tmp_path)).draw([0], 4).start != layouts.start[0]).any()
 
 
+@pytest.mark.parametrize("corners", ["[[-0.35,-0.25],[0.35,0.25]]", "[[-0.2,-0.25],[0.9,0.25]]"])
+@pytest.mark.parametrize("scenario", ["map", "floors"])
+def test_drawn_ends_are_free_for_the_body_of_the_vehicle(scenario: str, corners: str, tmp_path: Path) -> None:
+    """They were for the scenario's ball alone: every third of these began or ended in a wall."""
+    words = [f"scenario={scenario}", *([f"scenario.path={rooms(tmp_path)}"] if scenario == "map" else [])]
+    setup = compose([*words, "model=unicycle", f"+model.vehicle.footprint={corners}", "+model.vehicle.cells=[3,2]"])
+    layouts = setup.layouts(16)
+    for group in layouts.alike():
+        problem = setup.task(layouts.take(group)).problem
+        assert bool(problem.start_is_clear.all())
+        ends = problem.cost.x_ref[:, -1]
+        assert all(bool(obstacles.start_is_clear(ends).all()) for obstacles in problem.obstacles)
+    drawn = setup.vehicle.among(compose([*words, "model=unicycle"]).scenario, range(4))
+    assert np.array_equal(drawn.layouts.start, layouts.take(range(4)).start)
+
+
+def test_a_body_without_a_place_is_told(tmp_path: Path) -> None:
+    words = ["scenario=map", f"scenario.path={rooms(tmp_path)}", "model=unicycle", "+model.vehicle.cells=[8,2]"]
+    long = compose([*words, "+model.vehicle.footprint=[[-3.5,-0.25],[3.5,0.25]]"])
+    with pytest.raises(InputError, match="free for the vehicle's body, turned as its start is") as error:
+        long.layouts(1)
+    assert error.value.field == "scenario.path"
+
+
 def test_one_end_is_given(tmp_path: Path) -> None:
     """The other is drawn from the space around it, here the closed room."""
     layouts = MapFile(rooms(tmp_path), goal=[7.875, 4.0], vehicle_radius=0.1).draw(range(20), 0)

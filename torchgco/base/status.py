@@ -35,7 +35,7 @@ class Status(Explained):
     NON_FINITE = 5, "A state, cost or derivative became NaN or infinite."
     INFEASIBLE = 6, ("No iterate met the constraints, and nothing that was tried lowers the violation further; the "
         "least violated trajectory is returned. `solution.explain` says what may help.")  # fmt: skip
-    INVALID_START = 7, "The start lies inside an obstacle; nothing was solved."
+    INVALID_START = 7, "The start lies inside an obstacle, or touches another vehicle of the fleet; nothing was solved."
     FEASIBLE = 8, "The violation is under the tolerance, but the trajectory is not stationary: its cost can be lowered."
     TIME_LIMIT = 9, "The time limit ended the solve before the trajectory was stationary or feasible."
     UNBOUNDED = 10, ("The cost falls without end, so there is no optimum; bound the controls or states that grow, or "

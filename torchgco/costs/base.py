@@ -21,13 +21,14 @@ from torchgco.base.values import asks_for_knot, bound_values, whole_numbers_beco
 class Cost(PerElement):
     """J_var = terminal(x_N) + sum_k stage(x_k, u_k, k).
 
-    A subclass defines `stage` and `terminal` on any leading axes; derivatives are exact unless it overrides `expand`
-    too. A Hessian that isn't positive semidefinite is handled by the solver's regularisation.
+    A subclass defines `stage` and `terminal` on any leading axes, and no other sum of them; derivatives are exact
+    unless it overrides `expand` too. A Hessian that isn't positive semidefinite is handled by the solver's
+    regularisation.
 
     On a CPU the code is traced and compiled (`torchgco.native`). Values that differ between problems (`batched`,
     `per_element`) or between stages (indexed with k or computed from it) become inputs of the compiled code. A cost
-    that branches on the values of x, u or k, or that joins several knots, is evaluated by PyTorch, and a warning
-    names it.
+    that branches on the values of x, u or k is evaluated by PyTorch, and a warning names it; one that joins several
+    knots is refused.
     """
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
@@ -76,8 +77,6 @@ class Cost(PerElement):
 
     def with_more(self, n: int, r: int) -> Cost:
         """The same cost in a form of the problem with r further states after the first n."""
-        if type(self).total is not Cost.total:
-            return OwnTotal(self, n)
         return FirstStates(self, n) if type(self).expand is Cost.expand else OwnExpansion(self, n)
 
     @property
@@ -220,13 +219,6 @@ class OwnExpansion(FirstStates):
     def expand(self, X: Tensor, U: Tensor, H: Tensor) -> None:
         H.zero_()
         add_first(H, X, self.n, U.shape[-1], lambda blocks: self.cost.expand(X[..., : self.n], U, blocks))
-
-
-class OwnTotal(OwnExpansion):
-    """Where it has its own `total`."""
-
-    def total(self, X: Tensor, U: Tensor) -> Tensor:
-        return self.cost.total(X[..., : self.n], U)
 
 
 def add_at(H: Tensor, knots: Any, span: slice, n: int, gradient: Tensor, hessian: Tensor) -> None:

@@ -10,15 +10,12 @@ from torch import Tensor
 
 from torchgco.base.autodiff import hessian_forward, jacobian, not_finite
 from torchgco.base.clock import loading
-from torchgco.base.errors import InputError
 from torchgco.base.shapes import MISTAKES
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.obstacles.base import OwnKind
-from torchgco.problem.border import ONE_KNOT
-from torchgco.problem.joined import scattered
 from torchgco.problem.problem import Problem
 
 DIRECTIONS_AT_ONCE = 2**20  # numbers of w, over all directions, that are differentiated together: bounds the memory
@@ -107,9 +104,6 @@ def expansion_of(function: Function, w: Tensor) -> Expansion:
     return flat
 
 
-STATE_OFFSET = 1e-3  # of the states at which rows are looked at, as a share of 1 + |x|
-
-
 @dataclass(frozen=True)
 class Functions:
     """The dynamics, the cost and some constraints of b problems with K knots; z = [x, u] are the S variables of a knot.
@@ -127,16 +121,9 @@ class Functions:
 
     @classmethod
     def of(cls, problem: Problem, called: Iterable[int]) -> Functions:
-        """The functions of a form of problems, with the constraints of these numbers.
-
-        Raises:
-            InputError: rows of a constraint that join knots.
-        """
+        """The functions of a form of problems, with the constraints of these numbers."""
         alone = problem.take(slice(0, 1))
         n, (X, U) = problem.n, alone.at_rest
-        for i in called:
-            if is_users(user := alone.constraints[i]) and not is_function(user) and joins_knots(user, alone):
-                raise InputError(f"constraints[{i}].value", ONE_KNOT, "rows that change with other knots")
         rows = {i: expansion_of(*_by_knots(alone.constraints[i], X, U)[:2]) for i in called}
         step = lambda z: alone.along.step(z[..., :n], z[..., n:])
         return cls(problem, rows, expansion_of(step, torch.cat((X[:, :-1], U), dim=-1)))
@@ -195,26 +182,6 @@ def joined(X: Tensor, U: Tensor) -> Tensor:
     return torch.cat((X, torch.nn.functional.pad(U, (0, 0, 0, 1))), dim=-1)
 
 
-@loading()
-def joins_knots(part: Constraint, problem: Problem) -> bool:
-    """Whether rows of a constraint of one problem change with another knot than their own.
-
-    Any two knots differ in a digit of their numbers: knots with that digit change, and rows of the others are looked
-    at.
-    """
-    z = joined(*problem.at_rest)
-    z = z + STATE_OFFSET * (1.0 + z.abs()) * (1.0 + 0.5 * scattered(z))
-    value, n = lambda z: part.value(z[..., :n], z[:, :-1, n:]), problem.n
-    knot = torch.arange(problem.N + 1, device=z.device)
-    for digit in range(problem.N.bit_length()):
-        for moves in ((knot >> digit & 1).bool(), ~(knot >> digit & 1).bool()):
-            tangent = moves.to(z.dtype).view(1, -1, 1) * (1.0 + 0.5 * scattered(z))
-            change = torch.func.jvp(value, (z,), (tangent,))[1]
-            if bool((change[:, ~moves[part.knots]] != 0).any()):
-                return True
-    return False
-
-
 def is_function(part: Constraint) -> bool:
     """Whether rows are a function of their own knot's x, u or both."""
     return isinstance(part, FunctionConstraint) and type(part).value is FunctionConstraint.value
@@ -241,7 +208,7 @@ def _expand_exactly(cost: Cost, X: Tensor, U: Tensor, H: Tensor) -> None:
     """Write gradient and exact Hessian into homogeneous blocks; a cost's own `expand` may leave parts of it out."""
     if isinstance(cost, ShiftedCost):
         _expand_exactly(cost.cost, X, U, H)
-    elif isinstance(cost, BoundQuadratic) or type(cost).total is not Cost.total:
+    elif isinstance(cost, BoundQuadratic):
         cost.expand(X, U, H)
     else:
         Cost.expand(cost, X, U, H)

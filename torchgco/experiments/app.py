@@ -7,6 +7,8 @@ import re
 import sys
 import traceback
 import warnings
+from contextlib import redirect_stderr
+from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -156,11 +158,12 @@ def _command() -> int:
     parser = get_args_parser()
     parser.error = _refuse_flags
     try:
-        words = parser.parse_intermixed_args().overrides
+        asked = parser.parse_intermixed_args()
+        words = asked.overrides
         check_once(words)
         # Hydra's own main reads them, and takes no flags between words.
         sys.argv[1:] = [*(word for word in sys.argv[1:] if word not in words), *hydra_words(words)]
-        _run()
+        _shown(asked.package) if asked.cfg and asked.package else _run()
     except InputError:
         raise
     except (HydraException, OmegaConfBaseException) as error:
@@ -179,6 +182,17 @@ def _command() -> int:
             raise
         raise InputError("command line", "words that Hydra accepts", error) from None
     return 0
+
+
+def _shown(package: str) -> None:
+    """Print a part of the configuration; Hydra itself would write of one that isn't there, and exit."""
+    try:
+        with redirect_stderr(StringIO()):
+            _run()
+    except SystemExit as end:
+        if end.code:
+            raise InputError("-p", "a group or a key of the configuration", package) from None
+        raise
 
 
 def _refuse_flags(message: str) -> NoReturn:

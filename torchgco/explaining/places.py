@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.gates import GateSquares
-from torchgco.costs.base import Cost
 from torchgco.judging.gates import passages
 from torchgco.judging.worst import NO_PLACE, kind_of, worst_rows
 from torchgco.problem.problem import Problem
@@ -92,10 +91,9 @@ def lost_told(problem: Problem, X: Tensor, U: Tensor, t: Tensor | None) -> str |
     """
     cost, every, s = problem.cost, torch.arange(X.shape[1], device=X.device), X.shape[-1] + 1 + U.shape[-1]
     parts: list[tuple[str, Tensor, Tensor]] = []
-    if type(cost).total is Cost.total:
-        with cost.precision(X.dtype):
-            parts.append(("cost.stage", every[:-1], cost.stage(X[:, :-1], U, every[:-1])))
-            parts.append(("cost.terminal", every[-1:], cost.terminal(X[:, -1:])))
+    with cost.precision(X.dtype):
+        parts.append(("cost.stage", every[:-1], cost.stage(X[:, :-1], U, every[:-1])))
+        parts.append(("cost.terminal", every[-1:], cost.terminal(X[:, -1:])))
     H = X.new_zeros(1, len(every), s, s)
     cost.expand(X, U, H)
     slopes = [("the derivative of the cost", every, H)]

@@ -36,7 +36,7 @@ class Fleet:
     Raises:
         InputError: fewer than two vehicles, another N, dt, batch or dimension of space, problems that aren't float64 on
             the CPU, a free time, a horizon or free starts, pairs of unknown vehicles or given twice, distances that
-            aren't above 0, starts that touch.
+            aren't above 0.
     """
 
     vehicles: Sequence[Problem] | Problem
@@ -53,7 +53,6 @@ class Fleet:
         apart = _distances(self.apart, pairs, len(members), members[0].x0)
         for name, part in {"members": members, "distances": apart}.items():
             object.__setattr__(self, name, part)
-        _check_starts(self)
         forms = ((self.vehicles, tuple(range(len(members)))),) if isinstance(self.vehicles, Problem) else ()
         object.__setattr__(self, "forms", forms or _forms(members))
 
@@ -90,6 +89,13 @@ class Fleet:
         """Both vehicles of the Q pairs that keep a distance, the first below the second, (Q,) each."""
         first, second = self.distances.triu().nonzero(as_tuple=True)
         return first, second
+
+    @property
+    def start_is_apart(self) -> Tensor:
+        """Which vehicles start without touching another that they keep a distance from, (B, V) bool."""
+        p = self.places([one.x0.unsqueeze(1) for one in self.members])[:, :, 0]
+        gap = (p.unsqueeze(1) - p.unsqueeze(2)).norm(dim=-1)
+        return ~(gap < CONTACT_FACTOR * self.distances).any(-1)
 
     def places(self, X: Sequence[Tensor]) -> Tensor:
         """Positions (B, V, K, d) of the vehicles in states (B, K, n) each."""
@@ -170,16 +176,6 @@ def _distances(apart: Any, pairs: list[tuple[int, int]], V: int, like: Tensor) -
     for (i, j), distance in zip(pairs, given.expand(len(pairs)).tolist(), strict=True):
         found[i, j] = found[j, i] = distance
     return found
-
-
-def _check_starts(fleet: Fleet) -> None:
-    p = fleet.places([one.x0.unsqueeze(1) for one in fleet.members])[:, :, 0]
-    gap = (p.unsqueeze(1) - p.unsqueeze(2)).norm(dim=-1)
-    close = (gap < CONTACT_FACTOR * fleet.distances).nonzero()
-    if len(close):
-        b, i, j = close[0].tolist()
-        got = f"vehicles {i} and {j} of fleet {b}, {float(gap[b, i, j]):.3g} m apart"
-        raise InputError("fleet.vehicles", f"starts {float(fleet.distances[i, j]):g} m apart", got)
 
 
 def _forms(members: tuple[Problem, ...]) -> tuple[tuple[Problem, tuple[int, ...]], ...]:

@@ -161,7 +161,7 @@ def _late(ends: float | None) -> bool:
 
 
 def alone(fleet: Fleet, solve: Solve, seed: int, ids: Tensor, solver: Any) -> Plans:
-    """Each vehicle as if there were no other."""
+    """Each vehicle as if there were no other; those that touch another at the start have no valid one."""
     plans = Plans.at_rest(fleet)
     for problem, whose in fleet.forms:
         own = torch.cat([ids * fleet.V + v for v in whose])
@@ -170,4 +170,6 @@ def alone(fleet: Fleet, solve: Solve, seed: int, ids: Tensor, solver: Any) -> Pl
             rows = torch.arange(fleet.B)
             plans.set(v, rows, found, place * fleet.B + rows)
             plans.iterations[:, v] = found.iterations[place * fleet.B + rows]
+    touches = ~fleet.start_is_apart & (plans.status != Status.NON_FINITE)
+    plans.status = torch.where(touches, int(Status.INVALID_START), plans.status)
     return plans

@@ -20,7 +20,6 @@ from torch import Tensor
 from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users, take
-from torchgco.costs.base import Cost
 from torchgco.dynamics.base import INTEGRATORS
 from torchgco.problem.horizons import at_rest_after, within_horizons
 from torchgco.problem.in_time import at_times
@@ -336,8 +335,6 @@ def _size(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     At least `LEAST_COST` of the cost of staying at the start: what vanishes there, as a fit's misfit, has no size.
     """
     cost, least = problem.cost, LEAST_COST * problem.cost.total(*problem.at_rest).abs().nan_to_num(0.0, 0.0)
-    if type(cost).total is not Cost.total:
-        return torch.maximum(cost.total(X, U).abs(), least)
     k = torch.arange(U.shape[1], device=U.device)
     with cost.precision(X.dtype):
         size = cost.stage(X[:, :-1], U, k).abs().sum(-1) + cost.terminal(X[:, -1]).abs()

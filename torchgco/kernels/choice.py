@@ -23,6 +23,7 @@ from torchgco.base.together import Together
 from torchgco.base.tree import PerElement, field_names, is_users, mapped
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
+from torchgco.native.codegen.knot import JoinedKnots
 from torchgco.native.compiler import NativeError, find_compiler
 from torchgco.native.cuda.compiler import Loaded, available
 from torchgco.native.cuda.engine import OnDevice, has_served, working_on
@@ -124,6 +125,9 @@ def kernels_of(problem: Problem) -> Kernels:
 
     PyTorch's are used on a GPU, in single precision, where the process has chosen them (`use_native`), and where a part
     can't be traced or nothing compiles, which an EagerWarning explains.
+
+    Raises:
+        InputError: rows of a knot that read other knots, where the trace alone shows that they do.
     """
     known = problem.known
     if _uses_native and known.in_c is None and problem.x0.dtype == torch.float64 and problem.x0.device.type == "cpu":
@@ -150,6 +154,8 @@ def serves(problem: Problem) -> bool:
 def _natively(problem: Problem) -> NativeKernels | None:
     try:
         return _in_c(problem)
+    except JoinedKnots:
+        raise
     except (InputError, NativeError) as error:
         _check_eager(problem)
         _warn(problem.known.warned, error)

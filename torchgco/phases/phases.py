@@ -19,7 +19,6 @@ from torchgco.base.tree import PerElement, Rows
 from torchgco.base.values import NO_VALUES, Values, bound_values
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.link import Link
-from torchgco.costs.base import Cost
 from torchgco.problem.given import bound, facts_of
 from torchgco.problem.joined import mixes_problems
 from torchgco.problem.problem import Problem
@@ -268,8 +267,6 @@ def _check(one: Problem, first: Problem, i: int) -> None:
         raise InputError(f"{where}.horizon", "None: the N of a phase is that of all problems", "a horizon")
     if i > 0 and one.free_start is not None:
         raise InputError(f"{where}.free_start", "None: only the first start may be free", "a free start")
-    if type(one.cost).total is not Cost.total and not hasattr(one.cost, "diagonal"):
-        raise InputError(f"{where}.cost", "a sum over stages", f"{type(one.cost).__name__}.total")
 
 
 def _between(jumps: Any, members: tuple[Problem, ...]) -> tuple[Jump, ...]:

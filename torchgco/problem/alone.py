@@ -21,7 +21,7 @@ from torchgco.constraints.between_knots import BetweenKnots
 from torchgco.constraints.link import Integral, Summed
 from torchgco.costs.base import Cost
 from torchgco.dynamics.base import Dynamics
-from torchgco.problem.border import ONE_KNOT, OWN_ROW, STEP_OF_STAGE, called
+from torchgco.problem.border import ONE_KNOT, OWN_ROW, STEP_OF_STAGE, SUM_OF_STAGES, called
 from torchgco.problem.in_time import at_times
 from torchgco.problem.joined import unlike
 from torchgco.problem.problem import Problem
@@ -48,7 +48,7 @@ def row_by_row(problem: Problem, again: bool = False) -> Problem:
         if isinstance(part, Dynamics):
             return _made(spared, _Field if type(part).step is Dynamics.step else _Step)
         if isinstance(part, Cost):
-            return _made(spared, _Cost if type(part).total is Cost.total else _Total)
+            return _made(spared, _Cost)
         return _rows_alone(spared)
 
     return with_looking(problem, change, again)
@@ -95,11 +95,10 @@ def _values(problem: Problem, apart: Problem) -> Iterator[tuple[str, str, Values
     if apart.dynamics is not problem.dynamics:
         yield "dynamics.step", STEP_OF_STAGE, _steps
     if apart.cost is not problem.cost:
-        if isinstance(apart.cost, _Total):
-            yield "cost.total", OWN_ROW, lambda p, X, U, _: p.cost.total(X, U)
-        else:
-            yield "cost.stage", OWN_ROW, _stages
-            yield "cost.terminal", OWN_ROW, lambda p, X, U, _: p.cost.terminal(X[:, -1])
+        yield "cost.stage", OWN_ROW, _stages
+        yield "cost.terminal", OWN_ROW, lambda p, X, U, _: p.cost.terminal(X[:, -1])
+        if type(problem.cost).total is not Cost.total:
+            yield "cost.total", SUM_OF_STAGES, lambda p, X, U, _: p.cost.total(X, U)
     for i, (bound, other) in enumerate(zip(problem.constraints, apart.constraints, strict=True)):
         if bound is not other:
             rows = bound.constraint if isinstance(bound, BetweenKnots) else bound
@@ -209,6 +208,8 @@ class _Step(_Field):
 
 
 class _Cost(Cost):
+    total = Cost.total  # of rows by themselves
+
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         if x.shape[:-1] == (1,):
             return super().stage(x, u, k)
@@ -219,13 +220,6 @@ class _Cost(Cost):
         if x.shape[:-1] == (1,):
             return super().terminal(x)
         return _each(lambda b, i: self.take(_one(b)).terminal(_at(x, b, i)), x)
-
-
-class _Total(_Cost):
-    def total(self, X: Tensor, U: Tensor) -> Tensor:
-        if len(X) == 1:
-            return super().total(X, U)
-        return torch.cat([self.take(_one(b)).total(X[_one(b)], U[_one(b)]) for b in range(len(X))])
 
 
 class _Function(FunctionConstraint):

@@ -15,17 +15,16 @@ from torch import Tensor
 from torchgco.base.autodiff import WithoutReading, gradients_at_once
 from torchgco.base.draws import scattered
 from torchgco.base.errors import InputError, theirs
-from torchgco.base.mixing import foreign, why
-from torchgco.base.options import Seconds, check_value
-from torchgco.base.shapes import MISTAKES, check_tensor, describe
+from torchgco.base.mixing import why
+from torchgco.base.shapes import MISTAKES, describe
 from torchgco.base.tree import is_users
 from torchgco.base.values import asks_for_knot, whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost, FunctionCost
-from torchgco.dynamics.base import Dynamics, Integrator
+from torchgco.dynamics.base import Dynamics
 from torchgco.dynamics.names import controls_of, states_of
-from torchgco.problem.joined import depends_on_axes, joined_knots, mixes_problems, unlike
+from torchgco.problem.joined import DRAWN_SIZES, depends_on_axes, joined_knots, mixes_problems, unlike
 
 OFFSET = 1e-3  # by which the rows of a check differ, as a share of 1 + |x|
 DERIVATIVE_SHARE = 1e-2  # share of a derivative by which differences may disagree
@@ -38,47 +37,11 @@ ANY_AXES = (
     "whether k is a number or a tensor (K,)"
 )
 ONE_STAGE = "numbers of a stage that depend on its own state and control alone (changes along the way: an extra state)"
+SUM_OF_STAGES = "the sum of its stages and its terminal cost (changes along the way: an extra state)"
 ONE_KNOT = (
     "rows of one knot (sums along knots: Integral or an extra state; changes of controls: RateBounds; two knots: Link; "
     "numbers per knot: `knot_values`, or an argument k)"
 )
-
-
-def check_model(dynamics: Dynamics, x0: Tensor) -> None:
-    """Check a model's time step, position, parameters and first step, for starts x0 (B, n).
-
-    Raises:
-        InputError: names what is at fault.
-    """
-    check_value(getattr(dynamics, "dt", None), Seconds | None, "dynamics.dt")
-    if type(dynamics).step is Dynamics.step:
-        check_value(dynamics.integrator, Integrator, "dynamics.integrator")
-    where, n = dynamics.position, dynamics.n
-    if where is not None and where not in [slice(i, j) for j in range(1, n + 1) for i in range(j)]:
-        raise InputError("dynamics.position", f"a slice of states within 0..{n}, or None", repr(where))
-    for name in dynamics.per_element:
-        _check_parameter(getattr(dynamics, name), f"dynamics.{name}", x0)
-    step, start = dynamics.at(0).step, (x0, x0.new_zeros(x0.shape[0], dynamics.m))
-    expected = f"a step for {x0.dtype} states {tuple(x0.shape)}, as x0"
-    try:
-        after = step(*start)
-    except MISTAKES as error:
-        raise InputError("dynamics.step", expected, why(error, step, *start)) from theirs(error)
-    if not isinstance(after, Tensor) or after.shape != x0.shape or after.dtype != x0.dtype:
-        got = foreign(x0.dtype, step, *start) if isinstance(after, Tensor) else None
-        raise InputError("dynamics.step", f"{x0.dtype} states {tuple(x0.shape)}", got or describe(after))
-
-
-def _check_parameter(value: object, field: str, x0: Tensor) -> None:
-    B = x0.shape[0]
-    if not isinstance(value, Tensor):
-        check_value(value, float, field)
-    elif value.dim() > 0:
-        if tuple(value.shape) not in ((B,), (1,)):
-            raise InputError(field, f"a number or a tensor ({B},)", tuple(value.shape))
-        if value.dtype != x0.dtype or value.device != x0.device:
-            raise InputError(field, f"{x0.dtype} on {x0.device} as x0", f"{value.dtype} on {value.device}")
-        check_tensor(value, field)
 
 
 def check_dynamics(dynamics: Dynamics, x0: Tensor, N: int) -> None:
@@ -151,13 +114,14 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
     row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
     _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
-    if type(cost).total is Cost.total:
-        _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
+    _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
     _check_axes("cost.terminal", lambda _, x: row_cost.terminal(x), False, k[:1], X[:, -1:])
     _check_apart("cost.stage", stage, rows, X[:, :-1], U)
     _check_apart("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, X[:, 0], U[:, 0])
     _check_apart("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, X[:, -1])
-    if type(cost).expand is Cost.expand and type(cost).total is Cost.total:
+    if type(cost).total is not Cost.total:
+        _check_total(row_cost, X, U)
+    if type(cost).expand is Cost.expand:
         _check_slope("cost.stage", lambda x, u: row_cost.stage(x, u, k).sum(-1), X[:, :-1], U)
         _check_slope("cost.terminal", lambda x, u: row_cost.terminal(x), X[:, -1], U[:, -1])
         return
@@ -186,6 +150,21 @@ def _check_cost_of_stages(cost: Cost, takes_k: bool, rows: Tensor, k: Tensor, X:
         raise InputError("cost.stage", ONE_STAGE, f"others at stage {index}, or where other states lie beside")
 
 
+def _check_total(cost: Cost, X: Tensor, U: Tensor) -> None:
+    """Check that the own sum of a cost of two problems is that of its stages and its terminal cost, also far away."""
+    for size in (0.0, *DRAWN_SIZES):
+        x, u = (z if size == 0.0 else size * scattered(z) for z in (X, U))
+        try:
+            due = Cost.total(cost, x, u)
+        except MISTAKES:  # such states are refused
+            continue
+        own = called("cost.total", SUM_OF_STAGES, cost.total, x, u)
+        check_result("cost.total", own, tuple(due.shape), due.dtype, SUM_OF_STAGES)
+        if bool((wrong := unlike(own, due)).any()):
+            got, wanted = (float(values[wrong][0]) for values in (own, due))
+            raise InputError("cost.total", SUM_OF_STAGES, f"{got:.6g} where these add up to {wanted:.6g}")
+
+
 def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: int) -> None:
     """Check a user's constraint, bound to problems of N stages and m controls that start at x0 (B, n).
 
@@ -207,6 +186,8 @@ def check_constraint(constraint: Constraint, field: str, x0: Tensor, N: int, m: 
         _check_rows(constraint, field, rows, len(x0), X, U)
     else:
         _check_apart(field, value, rows, X, U)
+        if not constraint.joins_knots:
+            _check_rows_of_class(constraint, field, rows, X, U)
     weights = 1.0 + 0.5 * scattered(X.new_empty(shape))
 
     def own(dX: Tensor, dU: Tensor) -> Tensor:
@@ -245,6 +226,28 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
         got = f"rows of knot {int(knots[differing])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
     _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
+
+
+def _check_rows_of_class(constraint: Constraint, field: str, rows: Tensor, X: Tensor, U: Tensor) -> None:
+    """Check that the rows of each knot are those of its own state and controls: by themselves of three knots."""
+    every = torch.arange(X.shape[1], device=X.device)
+    knots = every[constraint.knots]
+
+    def together(i: Tensor, _: Tensor, x: Tensor, u: Tensor) -> Tensor:
+        value = constraint.take(i).value(x, u[:, :-1])
+        whole = value.new_zeros(len(value), len(every), value.shape[-1])
+        return whole.index_copy(1, knots, value)
+
+    def alone(i: Tensor, k: Tensor, *z: Tensor) -> Tensor:
+        joint = together(i, k, *z).clone()
+        for j in knots[[0, len(knots) // 2, -1]].tolist():  # along a trajectory that stays there
+            joint[:, j] = together(i, k, *(arg[:, j : j + 1].expand_as(arg) for arg in z))[:, j]
+        return joint
+
+    arguments = X, torch.cat((U, torch.zeros_like(U[:, :1])), dim=1)  # the last knot has no control
+    differing = called(field, ONE_KNOT, joined_knots, together, alone, rows, every, arguments)
+    if differing is not None:
+        raise InputError(field, ONE_KNOT, f"rows of knot {differing} that depend on other knots or problems")
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:

@@ -13,7 +13,6 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.shapes import MISTAKES, Dimensions, tensor
 from torchgco.base.tree import PerElement
 from torchgco.constraints.base import resolve_knots
-from torchgco.costs.base import Cost
 from torchgco.costs.quadratic import QuadraticInFreeTime
 
 A_CLOCK = "time as a state of the model's own, whose derivative is 1, says what it is"
@@ -132,8 +131,6 @@ def check_served(problem: Any) -> None:
         raise InputError("dynamics", "a model of x' = field(x, u) where the time is free", got)
     if model.at(0) is not model:
         raise InputError("dynamics", f"the same model at all stages where the time is free; {A_CLOCK}", "one per stage")
-    if type(cost).total is not Cost.total and not hasattr(cost, "diagonal"):
-        raise InputError("cost", "a sum over stages where the time is free", f"{type(cost).__name__}.total")
     if _depends_on_stage(problem):
         raise InputError("cost", f"the same cost at all stages where the time is free; {A_CLOCK}", "one per stage")
     if isinstance(cost, QuadraticInFreeTime) and problem.time.count > 1:

@@ -138,8 +138,6 @@ def _cost(problem: Problem, running: Tensor) -> Cost:
         if cost.terminal_function is not None and asks_for_knot(cost.terminal_function):
             raise InputError("horizon", "a terminal function without an argument k: `knot_values` serve", "one with it")
         cost = replace(cost, values=cost.values.ending_at(problem.stages))
-    if type(cost).total is not Cost.total:
-        raise InputError("horizon", "a cost that is a sum over stages", f"{type(cost).__name__} with its own `total`")
     X, U = problem.at_rest
     first = cost.take(slice(None))
     n, z = problem.n, torch.cat((X[:, 0], U[:, 0]), dim=-1)

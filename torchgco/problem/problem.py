@@ -20,12 +20,13 @@ from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import Dynamics
 from torchgco.obstacles.base import Obstacles, warn_of_small
-from torchgco.problem.border import check_constraints, check_model, kind_of
+from torchgco.problem.border import check_constraints, kind_of
 from torchgco.problem.free_start import checked_horizon, chooses_position, clear_starts, moved_inside, start_mask
 from torchgco.problem.free_time import FreeTime, check_served
 from torchgco.problem.given import Given, as_given, bound, place, remember, replaced
 from torchgco.problem.goal import Goal, bound_goal, released, with_goal, without_goal
 from torchgco.problem.known import Known
+from torchgco.problem.model import check_model
 from torchgco.problem.scale import CostScale, changes_of, cost_scale, reach, savings
 from torchgco.problem.subset import Subset
 from torchgco.problem.summary import summary

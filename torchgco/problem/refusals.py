@@ -114,7 +114,7 @@ def sparing_part(part: Any, field: str, shape: tuple[int, int], refusals: Refusa
     if isinstance(part, Dynamics):
         mixin: type = _Model
     elif isinstance(part, Cost):
-        mixin = _Price if type(part).total is Cost.total else _Total
+        mixin = _Price
     else:
         mixin = _Function if _is_function(part) else _Rows
     own = {"refusals": refusals, "field_name": field, "rows_shape": shape}
@@ -188,18 +188,14 @@ class _Model(_Sparing, Dynamics):
 
 
 class _Price(_Sparing, Cost):
+    total = Cost.total  # of what is spared
+
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         evaluate = lambda part, x, u: super().stage(x, u, k)
         return self._spared(evaluate, _lost_number, x, u, splits=not isinstance(k, Tensor))
 
     def terminal(self, x: Tensor) -> Tensor:
         return self._spared(lambda part, x: super().terminal(x), _lost_number, x)
-
-
-class _Total(_Price):
-    def total(self, X: Tensor, U: Tensor) -> Tensor:
-        evaluate = lambda part, X, U: super().total(X, U)
-        return self._spared(evaluate, lambda X: _lost_number(X[:, 0]), X, U, splits=False)
 
 
 class _Function(_Sparing, Constraint):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -14,7 +15,45 @@ from torchgco.base.options import Seed, check_options, check_value
 from torchgco.scenarios import checks
 from torchgco.scenarios.layouts import Layouts, concatenate
 
+End = Literal["start", "goal"]
+ENDS: tuple[End, ...] = ("start", "goal")
 MAX_DRAWS = 5000  # rounds of redrawing points that lie too near, before an InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """The room that a vehicle takes up where it stands at start and goal.
+
+    Args:
+        start, goal: the balls that it consists of, centres from the position and radii, (P, d+1), m.
+        inner: radius of a ball about the position that it holds, m.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    inner: float
+
+    @classmethod
+    def of_ball(cls, radius: float, dimension: int) -> Footing:
+        """That of a vehicle that is a ball."""
+        ball = np.array([[*[0.0] * dimension, radius]])
+        return cls(ball, ball, radius)
+
+    def free(self, end: End, distance: np.ndarray, spacing: float, times: float, more: float = 0.0) -> np.ndarray:
+        """At which nodes (X, Y[, Z]) the vehicle can stand with its position, bool.
+
+        Args:
+            distance: from obstacles at the nodes, m; beyond them nothing is nearer than at the last ones.
+            spacing: of the nodes, m.
+            times, more: as free as for balls of so many radii and so many metres more.
+        """
+        free = np.ones(distance.shape, bool)
+        for *center, radius in getattr(self, end):
+            steps = np.rint(np.array(center) / spacing).astype(int)
+            off = float(np.linalg.norm(center - spacing * steps))  # from the nearest node, which knows as much more
+            places = (np.clip(np.arange(n) + by, 0, n - 1) for n, by in zip(distance.shape, steps, strict=True))
+            free &= distance[np.ix_(*places)] > times * radius + more + off
+        return free
 
 
 class Scenario(ABC):
@@ -27,6 +66,7 @@ class Scenario(ABC):
     name: str
 
     model: ClassVar[str | None] = None  # of those whose layouts any model flies, which one does by default; None: any
+    footing: ClassVar[Footing | None] = None  # of the vehicle that flies the layouts, where that is known
     shares_map = True  # whether all layouts have one map, where they have any
 
     @property
@@ -43,6 +83,12 @@ class Scenario(ABC):
     def available(self) -> int | None:
         """How many layouts there are; None where any number can be drawn."""
         return None
+
+    def flown_by(self, footing: Footing) -> Self:
+        """The scenario with starts and goals, where it draws any on a map, at which this vehicle is free."""
+        flown = copy.copy(self)
+        object.__setattr__(flown, "footing", footing)
+        return flown
 
     def draw(self, ids: Sequence[int], seed: int) -> Layouts:
         """The layouts numbered `ids` (each >= 0) under `seed` (>= 0), in that order.

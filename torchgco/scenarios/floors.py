@@ -18,7 +18,7 @@ from torchgco.maps.distance import DistanceField
 from torchgco.maps.grid import OccupancyGrid
 from torchgco.maps.ways import Ways
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import Scenario
+from torchgco.scenarios.base import ENDS, Footing, Scenario
 from torchgco.scenarios.layouts import Layouts
 
 PLANS = 50  # that are drawn for one layout, at most, until one has ends that are far enough apart
@@ -170,16 +170,20 @@ class Floors(Scenario):
         else:
             self.draw_rooms(rng, canvas)
         field = DistanceField.of(OccupancyGrid(canvas.occupied, np.zeros(2), self.resolution))
-        ways = Ways.through(field, 0, SURE * self.vehicle_radius)
-        free = np.flatnonzero(ways.distance.ravel() > ENDS_CLEAR * self.vehicle_radius)
-        start = int(rng.choice(free)) if ends is None else ways.node(ends[0])
+        vehicle = self.footing or Footing.of_ball(self.vehicle_radius, 2)
+        ways = Ways.through(field, 0, SURE * vehicle.inner)
+        clear = ENDS_CLEAR if ends is None else SURE
+        starts, goals = (vehicle.free(end, ways.distance, ways.spacing, clear).ravel() for end in ENDS)
+        if not starts.any():
+            return field, None, 0.0
+        start = int(rng.choice(np.flatnonzero(starts))) if ends is None else ways.node(ends[0])
         far, _ = ways.costs(ways.places(start))
         if ends is None:
-            there = free[np.isfinite(far[free]) & (far[free] >= self.apart)]
+            there = np.flatnonzero(goals & np.isfinite(far) & (far >= self.apart))
             goal = int(rng.choice(there)) if len(there) else start
         else:
             goal = ways.node(ends[1])
-        reached = np.isfinite(far[goal]) and far[goal] >= self.apart
+        reached = np.isfinite(far[goal]) and far[goal] >= self.apart and starts[start] and goals[goal]
         return field, ways.places([start, goal]) if reached else None, float(far[goal])
 
     def draw_rooms(self, rng: np.random.Generator, canvas: Canvas) -> None:

@@ -19,7 +19,7 @@ from torchgco.maps.files import read, read_task, usual_outside
 from torchgco.maps.grid import OccupancyGrid, coordinates
 from torchgco.roadmap.shortest import shortest_way
 from torchgco.scenarios import checks
-from torchgco.scenarios.base import MAX_DRAWS, Scenario, generator
+from torchgco.scenarios.base import ENDS, MAX_DRAWS, End, Footing, Scenario, generator
 from torchgco.scenarios.layouts import Layouts
 
 VEHICLE_RADIUS, GOAL_RADIUS = 0.25, 0.3  # m, where neither the command nor the file says them
@@ -35,7 +35,8 @@ class MapFile(Scenario):
     """A map read from a file by `torchgco.maps.read`, at once; its layouts differ by start and goal.
 
     Starts and goals that neither the command nor an npz file gives are drawn: uniformly from the largest connected
-    space that is free for the vehicle, at least 0.4 of its diagonal apart, else as far as can be.
+    space that is free for the vehicle, at least 0.4 of its diagonal apart, else as far as can be. A body is free with
+    all of its balls, turned as the vehicle's own start and goal are; connected is what a ball within it can reach.
 
     Args:
         path, resolution, radius, origin, height, topic, layer, box, solid, outside: see `read`.
@@ -134,30 +135,27 @@ class MapFile(Scenario):
         if self.start is not None and self.goal is not None:
             return self.start, self.goal
         fixed = self.goal if self.start is None else self.start
-        places = self._free(fixed)
-        apart = ENDS_APART * math.dist(places.min(0), places.max(0))
+        ends: list[End] = [end for end in ENDS if getattr(self, end) is None]
+        places = [self._free(end, fixed) for end in ends]
+        apart = ENDS_APART * math.dist(places[-1].min(0), places[-1].max(0))
         for _ in range(MAX_DRAWS):
-            first = places[rng.integers(len(places))] if fixed is None else fixed
-            second = places[rng.integers(len(places))]
+            *firsts, second = (each[rng.integers(len(each))] for each in places)
+            first = firsts[0] if fixed is None else fixed
             if math.dist(first, second) >= apart:
                 break
         else:
-            second = places[np.linalg.norm(places - first, axis=1).argmax()]
-        return (second, first) if self.start is None and fixed is not None else (first, second)
+            second = places[-1][np.linalg.norm(places[-1] - first, axis=1).argmax()]
+        return (first, second) if ends[-1] == "goal" else (second, first)
 
     def _stages_between(self, start: np.ndarray, goal: np.ndarray) -> int:
-        assert self.vehicle_radius is not None
-        way = shortest_way(self.map, self.vehicle_radius, start, goal)
+        way = shortest_way(self.map, self._vehicle.inner, start, goal)
         pace = DRAWN_PACES[self.dimension] if self.pace is None else self.pace
         return checks.stages_for(math.dist(start, goal) if way is None else way, pace, self.dt)
 
-    def _free(self, near: np.ndarray | None) -> np.ndarray:
-        """Places (P, d) of the connected free space around `near`; of the largest one where that is None."""
-        labels, count = self._labels
-        if not count:
-            expected = f"a map with a place that is free for a vehicle of radius {self.vehicle_radius:g} m"
-            raise InputError("scenario.vehicle_radius", expected, f"none in {self.path}")
-        sizes = np.bincount(labels.ravel())
+    def _free(self, end: End, near: np.ndarray | None) -> np.ndarray:
+        """Places (P, d) of an end in the connected free space around `near`; in the largest one where that is None."""
+        labels, free = self._spaces
+        sizes = np.bincount(labels[free["start"] & free["goal"]], minlength=2)
         chosen = int(sizes[1:].argmax()) + 1
         if near is not None:
             node = np.rint((near - self.map.origin[0]) / self.map.spacing).astype(int)
@@ -166,12 +164,25 @@ class MapFile(Scenario):
             if not chosen:
                 name = "goal" if self.start is None else "start"
                 raise InputError(f"scenario.{name}", "a place on the map that is free for the vehicle", near.tolist())
-        return self.map.origin[0] + self.map.spacing * np.argwhere(labels == chosen)
+        places = np.argwhere((labels == chosen) & free[end])
+        if not len(places):
+            vehicle, field = f"a vehicle of radius {self.vehicle_radius:g} m", "vehicle_radius"
+            if self.footing is not None:
+                vehicle, field = f"the vehicle's body, turned as its {end} is", "path"
+            expected = f"a map with a place that is free for {vehicle}"
+            raise InputError(f"scenario.{field}", expected, f"none in {self.path}")
+        return self.map.origin[0] + self.map.spacing * places
+
+    @property
+    def _vehicle(self) -> Footing:
+        assert self.vehicle_radius is not None
+        return self.footing or Footing.of_ball(self.vehicle_radius, self.dimension)
 
     @cached_property
-    def _labels(self) -> tuple[np.ndarray, int]:
-        """Numbers of the connected free spaces at the nodes, 0 where not free, and how many there are."""
+    def _spaces(self) -> tuple[np.ndarray, dict[End, np.ndarray]]:
+        """Numbers of the connected free spaces at the nodes, 0 where not free, and where each end is free."""
         from scipy.ndimage import label
 
-        assert self.vehicle_radius is not None
-        return label(self.map.values[0] > CLEAR * self.vehicle_radius + self.map.spacing)
+        values, spacing, vehicle = self.map.values[0], self.map.spacing, self._vehicle
+        free: dict[End, np.ndarray] = {end: vehicle.free(end, values, spacing, CLEAR, spacing) for end in ENDS}
+        return label(values > CLEAR * vehicle.inner + spacing)[0], free

@@ -28,7 +28,7 @@ from torchgco.obstacles.spheres import Spheres
 from torchgco.problem.free_time import FreeTime
 from torchgco.problem.goal import Goal
 from torchgco.problem.problem import Problem
-from torchgco.scenarios.base import Family, Scenario
+from torchgco.scenarios.base import Family, Footing, Scenario
 from torchgco.scenarios.layouts import SINES, Layouts
 
 STATE_ARRAYS = ("state_weight", "terminal_weight", "start", "goal")  # fields with one number per state
@@ -169,7 +169,21 @@ class Vehicle:
         """
         if isinstance(scenario, Family):
             scenario = replace(scenario, vehicle_radius=self.radius)
-        return self.task(self.at_rest(scenario.draw(list(ids), seed)), **where)
+        return self.task(self.at_rest(self.flying(scenario).draw(list(ids), seed)), **where)
+
+    def flying(self, scenario: Scenario) -> Scenario:
+        """The scenario with starts and goals that are free for this vehicle, where it is a body and they are drawn."""
+        body, position = self.body, self.dynamics.position
+        if body is None or position is None or scenario.dimension != self.dimension:
+            return scenario
+        nothing = Layouts(np.zeros((1, 0, self.dimension)), np.zeros((1, 0)))
+        balls, inner = self.task(nothing).problem.obstacles[0].body, body.inscribed_radius
+        if balls is None:  # a single ball at the position
+            return scenario.flown_by(Footing.of_ball(inner, self.dimension))
+        states = torch.tensor([list(self.start), list(self.goal)], dtype=torch.float64)
+        centers = balls.points.at(states.unsqueeze(0))[0] - states[:, None, position]
+        start, goal = torch.cat((centers, balls.radii.view(1, -1, 1).expand(2, -1, 1)), dim=-1).numpy()
+        return scenario.flown_by(Footing(start, goal, inner))
 
     @property
     def dimension(self) -> int:

@@ -192,9 +192,9 @@ class Solver(Brief, Checked):
                 trajectories so far. Results then depend on the speed of the machine. Compiling, which a form of problem
                 needs once, doesn't count. ipopt and fatrop solve each problem in its share of the time, in a process
                 that ends then, and return the guess where they aren't ready; the other baselines ignore it.
-            X0: states to begin with (B, N+1, n), which U0 need not lead to, for solvers that `take_states`; where one
-                isn't finite, the problem begins with its start held. The first states are those of the problem, but
-                where these are free.
+            X0: states to begin with (B, N+1, n), which U0 need not lead to, for solvers that `take_states`. The first
+                states are those of the problem, but where these are free. A problem whose U0 or X0 isn't finite ends
+                NON_FINITE, as one whose start isn't.
 
         Raises:
             InputError: U0, ids, warm or X0 don't fit the problem, or an option of the solver doesn't; X0 where the
@@ -233,14 +233,15 @@ class Solver(Brief, Checked):
             if problem.B == 0:  # nothing to trace code with
                 Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
                 return replace(Solution.empty(problem), account=Account(problem, self))
-            whole = for_solvers(problem, self.joins_knots)
             if X0 is not None:
                 check_states(X0, problem)
+            problem.check_controls(U0)
+            problem = _without_starts(problem, U0, X0)
+            whole = for_solvers(problem, self.joins_knots)
             made = partial(Call.checked, whole, seed=seed, ids=ids, callback=callback, max_seconds=max_seconds)
             if problem.time is not None:
                 return self._in_time(problem, whole, U0, warm, X0, made)
             if problem.horizon is not None:
-                problem.check_controls(U0)
                 U0 = at_rest_after(problem, U0)
             call = made(U0, warm=warm)
             self.announce(call.problem)
@@ -265,7 +266,6 @@ class Solver(Brief, Checked):
         made: Callable[..., Call],
     ) -> Solution:
         """`solve` of a problem with a free time, which is `whole` for solvers; `made` makes a call of it."""
-        problem.check_controls(U0)
         lifted = None if warm is None else lifted_multipliers(problem, whole, warm)
         U = torch.cat((U0, U0.new_ones(*U0.shape[:2], whole.m - problem.m)), dim=-1)
         call = made(U, warm=lifted)
@@ -346,6 +346,18 @@ class Solver(Brief, Checked):
     def in_slots(self, slots: int) -> Solver | None:
         """The same solver with at most `slots` problems at a time; None where it takes all of them at once."""
         return None
+
+
+def _without_starts(problem: Problem, *guess: Tensor | None) -> Problem:
+    """The problem with NaN for the starts of those whose guess (B, ...) isn't finite: they end as if these weren't.
+
+    Some solvers would lose them, and others begin elsewhere without a word.
+    """
+    fine = [torch.isfinite(part).flatten(1).all(-1, keepdim=True) for part in guess if part is not None]
+    sound = torch.stack(fine).all(0)
+    if bool(sound.all()):
+        return problem
+    return problem.started_at(torch.where(sound, problem.x0, torch.nan), problem.constraints)
 
 
 @dataclass(frozen=True)

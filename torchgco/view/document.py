@@ -18,6 +18,8 @@ from torchgco.obstacles.base import Obstacles
 from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
 from torchgco.plotting.vehicle_body import VehicleBody
+from torchgco.plotting.ways import ways_along
+from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST_HALF, Packing, number
 from torchgco.view.sensed import Sensed
@@ -74,6 +76,8 @@ class ShownFlight:
         notes: one text per knot for the hover, of missions; none: nothing to say.
         sensed: what the vehicle saw and sought, of missions with a sensor.
         phase: which of several phases it is one of; None: there is but one.
+        way: positions (T, d) along the path that is judged, m, with `pieces` chords for each stage; None: the path's.
+        times: (K,) of the knots, s; None: multiples of the page's `dt`, or the layout's.
     """
 
     solver: str
@@ -88,14 +92,19 @@ class ShownFlight:
     notes: list[str] = field(default_factory=list)
     sensed: Sensed | None = None
     phase: ShownPhase | None = None
+    way: np.ndarray | None = None
+    pieces: int = 1
+    times: np.ndarray | None = None
 
     def until(self, last: int) -> ShownFlight:
         """The same up to a knot."""
         kept = slice(0, last + 1)
-        attitude = None if self.attitude is None else self.attitude[kept]
+        attitude, times = (None if part is None else part[kept] for part in (self.attitude, self.times))
+        way = None if self.way is None else self.way[: last * self.pieces + 1]
         return replace(
-            self, path=self.path[kept], attitude=attitude, violation=self.violation[kept], worst=self.worst[kept]
-        )
+            self, path=self.path[kept], attitude=attitude, violation=self.violation[kept], worst=self.worst[kept],
+            way=way, times=times,
+        )  # fmt: skip
 
     def packed(self, packing: Packing, number_of: int) -> dict[str, Any]:
         """As the page reads it, under the number of its solver."""
@@ -105,6 +114,10 @@ class ShownFlight:
         }  # fmt: skip
         if self.attitude is not None:
             entry["attitude"] = packing.put(self.attitude)
+        if self.way is not None:
+            entry |= {"way": packing.put(self.way, steps=True), "pieces": self.pieces}
+        if self.times is not None:
+            entry["times"] = packing.put(self.times, steps=True)
         bad = np.flatnonzero(self.violation > 0)
         entry["violated"] = [[int(k), number(self.violation[k], 3), int(self.worst[k])] for k in bad]
         if self.plan is not None:
@@ -158,6 +171,7 @@ def flights_of(
     rows: list[Rows],
     admitted: float,
     touching: np.ndarray,
+    times: Tensor | None = None,
 ) -> list[ShownFlight]:
     """The trajectories X (B, N+1, n), U (B, N, m) of one solver.
 
@@ -165,21 +179,28 @@ def flights_of(
         results, rows: of each problem, as in `ShownFlight`.
         admitted: the violation up to which nothing is marked.
         touching: (B,) bool: where contact is looked for.
+        times: of the knots (B, N+1), s, where the time is free.
     """
-    (violation, worst), flights = violated(problem, X, U, admitted), []
+    moving = paced(problem, times)
+    (violation, worst), flights = violated(moving, X, U, admitted), []
     dt = getattr(problem.dynamics, "dt", None) or 1.0
     states, body = X.detach().cpu().double().numpy(), VehicleBody.of(problem)
-    for b in range(problem.B):
+    ways = ways_along(problem, X, U, times, [range(problem.n)[problem.position]])
+    for b, way in enumerate(ways):
         kept = whole(states[b])
         path, knots = kept[:, problem.position], slice(0, len(kept))
+        fine = way.X[: way.pieces * (len(kept) - 1) + 1] if len(kept) else kept
         places = path[:0]
         bad, which = violation[b, knots], worst[b, knots]
         if touching[b] and len(path):
-            single = problem.take(torch.tensor([b], device=X.device))
-            places = contacts(single.obstacles, path, dt, kept)
+            single = moving.take(torch.tensor([b], device=X.device))
+            places = contacts(single.obstacles, fine[:, problem.position], dt / way.pieces, fine)
         told = [*rows[b], *worst_row(problem, bad, which)]
         attitude = look.attitude(kept) if body is None else turned(body, kept)
-        flights.append(ShownFlight(solver, path, attitude, results[b], told, bad, which, places))
+        flight = ShownFlight(solver, path, attitude, results[b], told, bad, which, places)
+        if way.pieces > 1:
+            flight = replace(flight, way=fine[:, problem.position], pieces=way.pieces)
+        flights.append(flight if times is None else replace(flight, times=times[b, knots].cpu().double().numpy()))
     return flights
 
 
@@ -240,7 +261,7 @@ class Document:
         """Add a layout: problem b of a batch, and its trajectories in the order of the solvers, where there are any.
 
         Args:
-            times: (N+1,) of the knots, s; None: multiples of `dt`.
+            times: (K,) of the knots of all flights, s; None: each flight's own, or multiples of `dt`.
             phases: the problem of each of several phases, of which `problem` is the first one.
         """
         packing, position, members = Packing(), problem.position, phases or [problem]
@@ -250,7 +271,8 @@ class Document:
         middle = start if goal is None else 0.5 * (start + goal)
         names = list(self.solvers)
         knots = max([problem.N, *(len(flight.path) - 1 for flight in flights)])
-        duration = knots * self.dt if times is None else float(times[-1])
+        ends = [float(each[-1]) for each in (times, *(flight.times for flight in flights)) if each is not None]
+        duration = max(ends, default=knots * self.dt)
         content: dict[str, Any] = {
             "start": _numbers(start), "goal": None if goal is None else _numbers(goal),
             "goal_radius": None if last.goal is None else number(last.goal.radius[b]),
@@ -262,7 +284,7 @@ class Document:
             ],
             "flights": [flight.packed(packing, names.index(flight.solver)) for flight in flights],
             "search": None if search is None else search.packed(packing),
-            "times": None if times is None else packing.put(times, steps=True),
+            "times": None if times is None else packing.put(times, steps=True), "free": problem.time is not None,
         }  # fmt: skip
         self.labels.append({"label": label, "results": {flight.solver: flight.result for flight in flights}})
         self.parts.append(packing.sealed(content))

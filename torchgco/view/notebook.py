@@ -12,7 +12,6 @@ from torchgco.base.html import HtmlPage
 from torchgco.base.shapes import check_shape
 from torchgco.judging.worst import kind_of
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -50,9 +49,9 @@ def _flights(problem: Problem, solution: Solution, name: str) -> list[ShownFligh
     if problem.B == 0:
         raise InputError("problem", "at least one problem to show", "an empty batch")
     look, (rows, results, touching) = look_of(problem.dynamics), _told(problem, solution)
-    return flights_of(
-        paced(problem, solution.times), look, solution.X, solution.U, name, results, rows, ADMITTED, touching
-    )
+    told = name, results, rows, ADMITTED, touching, solution.times
+    flights = flights_of(problem, look, solution.X, solution.U, *told)
+    return [replace(flight, times=None) for flight in flights]  # they are the layout's
 
 
 def show_phases(members: Sequence[Problem], solutions: Sequence[Solution], begins: np.ndarray) -> HtmlPage:

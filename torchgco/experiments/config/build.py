@@ -241,10 +241,11 @@ def build(configuration: dict[str, Any]) -> Setup:
         wanted = "the map: add scenario.path=FILE" if of_map else "the layout file: add scenario.path=FILE.npz"
         raise InputError("scenario.path", wanted, "none")
     devices, dtype = _devices(configuration["device"])
+    vehicle = _vehicle(configuration)
     setup = Setup(
         configuration=configuration,
-        vehicle=_vehicle(configuration),
-        scenario=_instantiate(scenario, "scenario"),
+        vehicle=vehicle,
+        scenario=vehicle.flying(_instantiate(scenario, "scenario")),
         solver=solver_of(configuration),
         solver_name=configuration["solver"]["name"],
         seed=configuration["seed"],

@@ -6,8 +6,9 @@ import argparse
 import json
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -21,7 +22,7 @@ from torchgco.base.options import Count, check_value
 from torchgco.base.version import VERSION
 from torchgco.experiments.config.build import DEFAULT_LAYOUTS, Setup, compose
 from torchgco.experiments.config.checks import check_once
-from torchgco.experiments.dataset.rows import ABOUT, MAP, files_of, rows_of, write_card
+from torchgco.experiments.dataset.rows import ABOUT, CARD, MAP, files_of, rows_of, write_card
 from torchgco.experiments.ending import RunParser, say
 from torchgco.experiments.flying.flight import Batch, Flown, Schedule, SolveBatch, Tasks, check_time, plan_of
 from torchgco.experiments.flying.metrics import check_metrics
@@ -29,7 +30,7 @@ from torchgco.experiments.flying.workers import Shared, cut, fly_all, trial_bar
 from torchgco.experiments.results.files import checksum, create, damaged, readable, write
 from torchgco.experiments.results.folder import COLUMNS
 from torchgco.experiments.results.identity import decisive, difference, layout_digests, settings_of
-from torchgco.experiments.results.lock import held
+from torchgco.experiments.results.lock import held_or_freed
 from torchgco.experiments.results.provenance import recorded, source
 from torchgco.scenarios import Task
 from torchgco.scenarios.layouts import MAP_ARRAYS, map_arrays
@@ -88,8 +89,9 @@ def make(folder: Path, words: Sequence[str], left_out: Sequence[LeftOut] = (), l
     tasks, first = Tasks(setup, setup.layouts(1)), setup.scenario.draw(range(min(2, available or 2)), setup.seed)
     task = _checked(tasks)
     command = [str(folder), *words]
-    with held(folder, plan.job, plan.jobs):
-        _claim(folder, setup, left_out)
+    about = _about(setup, left_out)
+    with held_or_freed(folder, plan.job, plan.jobs, partial(_free, folder, about)):
+        _claim(folder, about)
         absent: list[str] = list(left_out)
         if first.map is not None and first.count > 1 and first.map.batch is None:  # of all: not in every row
             arrays, absent = map_arrays(first.map), [*left_out, *MAP_ARRAYS]
@@ -128,22 +130,37 @@ def _checked(tasks: Tasks) -> Task:
     return task
 
 
-def _claim(folder: Path, setup: Setup, left_out: Sequence[str]) -> None:
-    """Make the folder that of this data set; InputError where it is another's, or holds other files."""
+def _about(setup: Setup, left_out: Sequence[str]) -> dict[str, Any]:
+    """What decides the rows of a data set."""
     configuration, solver = setup.configuration, {setup.solver_name: settings_of(setup.configuration)}
     about = {"version": VERSION, "seed": setup.seed, "left_out": sorted(left_out)} | decisive(configuration, solver)
     if os.path.isfile(path := configuration["scenario"].get("path") or ""):
         about["file"] = checksum(Path(path))  # it may be edited between two starts
-    text = json.dumps(about, indent=1, default=str).encode()
+    return json.loads(json.dumps(about, default=str))
+
+
+def _claim(folder: Path, about: Mapping[str, Any]) -> None:
+    """Make the folder that of this data set; InputError where it is another's, or holds other files."""
+    text = json.dumps(about, indent=1).encode()
     expected, there = "an empty folder, or one of this very data set", folder / ABOUT
     others = [path.name for path in folder.iterdir() if not path.name.startswith(BEFORE)]
     if others and not there.is_file():
         raise damaged(there, "is missing") if files_of(folder) else InputError("FOLDER", expected, f"{others[0]} in it")
     if create(there, lambda file: file.write(text)):
         return
-    stored, new = readable(there, lambda path: json.loads(regular(path).read_bytes())), json.loads(text)
-    if stored != new:
-        raise InputError("FOLDER", expected, f"{folder}, which holds another ({difference(stored, new)})")
+    if (stored := _stored(there)) != about:
+        raise InputError("FOLDER", expected, f"{folder}, which holds another ({difference(stored, about)})")
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    return readable(path, lambda path: json.loads(regular(path).read_bytes()))
+
+
+def _free(folder: Path, about: Mapping[str, Any]) -> None:
+    """Leave the folder to any data set, where this one has claimed it and nothing is solved."""
+    if not files_of(folder) and _stored(folder / ABOUT) == about:
+        for path in (*(folder / name for name in (ABOUT, MAP, CARD)), *folder.glob("run*.json")):
+            path.unlink(missing_ok=True)
 
 
 def _missing(folder: Path, count: int, repair: bool) -> np.ndarray:

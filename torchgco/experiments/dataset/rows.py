@@ -95,6 +95,9 @@ def read_dataset(
         rows = torchgco.read_dataset("data", columns=["X", "U", "reached"], layouts=range(512))
         X = np.stack(rows.loc[rows["reached"], "X"])  # (B, N+1, n)
 
+    Cells of one column may differ in shape: trajectories are as long as each layout's stages, and obstacles as many as
+    the layout of the same file with the most, rows of NaN where a layout has fewer.
+
     Args:
         columns: which; None: all, with `layout` in any case. README.md in the folder says what each is.
         layouts: which, by number, in any order; rows have their own. None: all. Only files with some of them are read:

@@ -36,7 +36,7 @@ from torchgco.experiments.results.identity import (
     settings_of,
 )
 from torchgco.experiments.results.kinds import check_objective
-from torchgco.experiments.results.lock import held
+from torchgco.experiments.results.lock import held_or_freed
 from torchgco.experiments.results.merge import values_of
 from torchgco.experiments.results.provenance import recorded
 from torchgco.explaining.advice import Facts, advice
@@ -78,7 +78,7 @@ def advised(tasks: Tasks, trials: pd.DataFrame) -> str:
 def where_to_start(tasks: Tasks) -> str:
     """What a study needs all of whose layouts begin inside an obstacle."""
     if tasks.layouts.vehicles is not None:
-        return "fleets of which one starts outside its obstacles"
+        return "a fleet whose vehicles start outside their obstacles, and apart"
     problem = tasks.of([0], exact=True).problem
     unknown = map_facts(problem, Status.INVALID_START, False)["in_unknown"]
     free = ", or scenario.unknown=free, as unknown cells count as occupied" if unknown else ""
@@ -130,7 +130,8 @@ def run_study(
     """Fly, judge, write and report; returns False where a job flew its share of a study that others finish.
 
     Started again on the same folder it resumes where it was stopped; a finished study only shows its table. Started
-    twice at once, the second waits for the first, and is refused where that takes too long.
+    twice at once, the second waits for the first, and is refused where that takes too long. Whatever is raised before
+    the first rows are kept leaves the folder to any study.
 
     Args:
         recompose: makes the configuration of a baseline.
@@ -146,7 +147,7 @@ def run_study(
     """
     study = _study(configuration, recompose)
     store = StudyFolder(folder, study.manifest, study.plan.repair)
-    with held(folder, study.plan.job, study.plan.jobs):
+    with held_or_freed(folder, study.plan.job, study.plan.jobs, store.free):
         store.claim()
         accepted()
         with recorded(folder, study.setup, study.plan, command) as ending:

@@ -165,13 +165,10 @@ def _trajectories(study: Study, searched: Mapping[int, SearchPart]) -> Document:
             here = [rows[name, number] for number in ids]
             touching = np.array([not row["clearance"] >= 0 for row in here])
             said = [result_of(row) for row in here], [told(row) for row in here]
-            flown.append(flights_of(problem, look, X, U, name, *said, ADMITTED, touching))
+            flown.append(flights_of(problem, look, X, U, name, *said, ADMITTED, touching, t))
         for b, number in enumerate(ids):
             shown = [flights[b] for flights in flown if len(flights[b].path)]
-            # The knots' times are those of the solver under study; others are shown at the same knots.
-            all_times = study.times
-            knot_times = None if all_times is None else all_times[document.solvers[0]][places[b], : problem.N + 1]
-            document.add(f"layout {number}", problem, b, shown, searched.get(number), knot_times)
+            document.add(f"layout {number}", problem, b, shown, searched.get(number))
         bar.update(len(ids))
         order.append(places)
     bar.close()

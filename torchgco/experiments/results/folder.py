@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -67,7 +68,7 @@ class StudyFolder:
             InputError: results of another study lie there, or the study's manifest is damaged or missing.
         """
         path = self.path / MANIFEST
-        orphaned = (self.path / TRIALS).is_file() or any(self.path.glob("shards/*.npz"))
+        orphaned = self._has_rows()
         there = path.is_file()  # looked at after the results, which another job of the study may be writing
         if there and self._claimed(path):
             return
@@ -78,6 +79,21 @@ class StudyFolder:
             write(path, lambda file: file.write(self.manifest.to_json()))
         elif not create(path, lambda file: file.write(self.manifest.to_json())):
             self._claimed(path)  # by another job meanwhile
+
+    def free(self) -> None:
+        """Leave the folder to any other study, where this one has claimed it and nothing is flown.
+
+        Raises:
+            InputError: the study's manifest is damaged or missing, or another's.
+        """
+        if not self._has_rows() and self._claimed(self.path / MANIFEST):
+            for path in (self.path / MANIFEST, *self.path.glob("run*.json"), *self.path.glob(".hydra/*.yaml")):
+                path.unlink(missing_ok=True)
+            with suppress(OSError):  # not there, or with files of somebody else
+                (self.path / ".hydra").rmdir()
+
+    def _has_rows(self) -> bool:
+        return (self.path / TRIALS).is_file() or any(self.path.glob("shards/*.npz"))
 
     def _claimed(self, path: Path) -> bool:
         """Whether study.json is this study's; False where it is damaged and to be repaired."""

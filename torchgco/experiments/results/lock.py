@@ -14,7 +14,7 @@ import platform
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -36,15 +36,37 @@ warnings.filterwarnings("ignore", "flock not supported on this filesystem", User
 
 
 @contextmanager
-def held(folder: Path, job: int | None = None, jobs: int | None = None) -> Iterator[None]:
+def held_or_freed(folder: Path, job: int | None, jobs: int | None, free: Callable[[], None]) -> Iterator[None]:
+    """As `held`; where the block raises and nobody else holds the study or a share of it, the folder is freed.
+
+    Args:
+        free: takes back what claims the folder, where that is this study's and nothing is flown.
+
+    Raises:
+        InputError: as `held`.
+    """
+    try:
+        with held(folder, job, jobs):
+            yield
+    except BaseException:
+        with suppress(InputError), held(folder, patience=0.0):
+            free()
+        raise
+
+
+@contextmanager
+def held(
+    folder: Path, job: int | None = None, jobs: int | None = None, patience: float | None = None
+) -> Iterator[None]:
     """Hold a study, or the share of job `job` of `jobs`, in this block.
 
-    Where others hold it, a line on stderr says so, and this process waits for them, PATIENCE at most.
+    Where others hold it, a line on stderr says so, and this process waits for them, `patience` at most (s; None:
+    PATIENCE).
 
     Raises:
         InputError: they still hold it then, or the folder can't be written to.
     """
-    claim = _Claim(folder, time.monotonic() + PATIENCE)
+    claim = _Claim(folder, time.monotonic() + (PATIENCE if patience is None else patience))
     lock = claim.whole() if job is None else claim.share(folder / f"{LOCK}-{job}-of-{jobs}")
     try:
         with suppress(OSError):  # only for the lines of others

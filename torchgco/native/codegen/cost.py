@@ -59,8 +59,6 @@ def trace_cost(problem: Problem) -> CostSource:
         InputError: a part that can't be traced, holds an operation without a counterpart, or joins several knots.
     """
     cost, *_ = unscaled(problem)
-    if type(cost).total is not Cost.total:
-        raise InputError(_named("total", cost), "the sum of stage and terminal costs for native kernels", "its own")
     block = None if type(cost).expand is Cost.expand else problem.n + 1 + problem.m
     stage, last = spans_of_cost(problem)
     spans = {"stage": stage, "last": last}

@@ -27,6 +27,10 @@ from torchgco.tracing.arrays import elements
 from torchgco.tracing.nets import Call
 
 
+class JoinedKnots(InputError):
+    """Code whose rows of a knot read other knots: no kernels serve it, as their derivatives are those of one knot."""
+
+
 @dataclass(frozen=True)
 class Span:
     """A traced function of X (1, states, n), U (1, controls, m) whose rows (1, K[, p]) belong to K `knots`."""
@@ -262,7 +266,7 @@ def _forms(span: Span) -> list[_Form]:
         inputs = [X[k], U[k] if k < span.controls else u, numbers[reads], *(call.outputs for call in inside)]
         function = ca.Function("knot", inputs, results, {"allow_free": True})
         if function.has_free():
-            raise InputError(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
+            raise JoinedKnots(traced.field, "rows that read their own knot alone", f"rows of knot {k} that read others")
         text = function.serialize()
         if text not in texts:
             texts[text] = _form(function)

@@ -15,20 +15,21 @@ export class Flights {
     this.space = space;
     this.thick = 0.0035 * space.size;
     this.all = layout.flights.filter((flight) => flight.path.rows > 0).map((flight) => this.built(flight));
-    this.all.forEach(({ line, points }, i) => {
-      const before = this.all.slice(0, i).map((one) => one.points);
+    this.all.forEach(({ line, drawn: points }, i) => {
+      const before = this.all.slice(0, i).map((one) => one.drawn);
       if (line) dashWhereShared(line.geometry, points, before, 1.5 * this.thick, 6 * this.thick);
     });
-    this.times = layout.times ? layout.times.data : null;
+    this.free = layout.free;
+    this.times = layout.times ? layout.times.data : null; // of the knots of all flights
     this.phases = layout.flights.map(({ phase }) => phase).filter(Boolean);
     const longest = Math.max(1, ...this.all.map((one) => one.flight.path.rows - 1));
     this.knots = this.phases.length ? this.times.length - 1 : longest; // phases follow each other
   }
 
-  /** When obstacles are at a time, s: they count in steps of equal length, and those of each phase from its start. */
+  /** When obstacles are at a time, s: unless it is free they count in steps of equal length, of each phase from its start. */
   clocks(t) {
     const knots = this.knotsAt(t);
-    if (!this.phases.length) return { times: [knots * this.head.dt], present: 0 };
+    if (!this.phases.length) return { times: [this.free ? t : knots * this.head.dt], present: 0 };
     const times = this.phases.map(({ first, stages, dt }) => Math.min(Math.max(knots - first, 0), stages) * dt);
     return { times, present: this.present(knots) };
   }
@@ -38,22 +39,29 @@ export class Flights {
     return Math.max(0, this.phases.findLastIndex(({ first }) => first <= knots));
   }
 
-  /** Seconds from the first knot to the last of the longest flight. */
+  /** Seconds from the first knot to the last of the flight that takes longest. */
   get duration() {
-    return this.timeOf(this.knots);
+    return Math.max(this.timeOf(this.knots), ...this.all.map(({ flight }) => (flight.times ? flight.times.data.at(-1) : 0)));
   }
 
-  /** The time of a knot, s. */
-  timeOf(k) {
-    return this.times ? this.times[Math.min(k, this.times.length - 1)] : k * this.head.dt;
+  /** The times of the knots of a flight, by default of the first one, s; null: steps of equal length. */
+  timesOf(flight = this.all[0]?.flight) {
+    return this.times ?? flight?.times?.data ?? null;
   }
 
-  /** How many knots have passed at a time, s; between two knots it is no whole number. */
-  knotsAt(t) {
-    if (!this.times) return t / this.head.dt;
-    const next = this.times.findIndex((time) => time > t);
-    if (next <= 0) return next === 0 ? 0 : this.times.length - 1;
-    return next - 1 + (t - this.times[next - 1]) / (this.times[next] - this.times[next - 1]);
+  /** The time of a knot of a flight, s. */
+  timeOf(k, flight) {
+    const times = this.timesOf(flight);
+    return times ? times[Math.min(k, times.length - 1)] : k * this.head.dt;
+  }
+
+  /** How many knots of a flight have passed at a time, s; between two knots it is no whole number. */
+  knotsAt(t, flight) {
+    const times = this.timesOf(flight);
+    if (!times) return t / this.head.dt;
+    const next = times.findIndex((time) => time > t);
+    if (next <= 0) return next === 0 ? 0 : times.length - 1;
+    return next - 1 + (t - times[next - 1]) / (times[next] - times[next - 1]);
   }
 
   place(x, y, z) {
@@ -68,8 +76,9 @@ export class Flights {
     const { name, colour } = this.head.solvers[flight.solver];
     const group = new THREE.Group();
     const points = this.points(flight.path);
+    const drawn = flight.way ? this.points(flight.way) : points; // along the path between the knots
     const paint = new THREE.MeshLambertMaterial({ color: colour });
-    const line = tube(points, (flight.solver === 0 ? 1 : 1.2) * this.thick, paint);
+    const line = tube(drawn, (flight.solver === 0 ? 1 : 1.2) * this.thick, paint);
     if (line) {
       // Seen through whatever stands before it.
       const ghost = new THREE.Mesh(
@@ -83,19 +92,20 @@ export class Flights {
     const { radius, shape, body: kind } = flight.phase ?? this.head;
     const body = vehicle(kind, radius || 0.012 * this.space.size, colour, this.space.flat, shape);
     body.add(dot(colour));
-    group.add(body, ...this.marks(flight, points));
+    group.add(body, ...this.marks(flight, drawn));
     const parts = flight.plan ? new MissionParts(flight, colour, this.space) : null;
     if (parts) group.add(parts.group);
     this.group.add(group);
-    return { flight, name, colour, group, points, line, body, parts };
+    return { flight, name, colour, group, points, drawn, line, body, parts };
   }
 
   /** Red where a constraint is violated, and a red mark at each contact. */
   marks(flight, points) {
     const found = [];
+    const pieces = flight.pieces ?? 1;
     const paint = new THREE.MeshLambertMaterial({ color: BAD });
     for (const [first, last] of runs(flight.violated.map(([k]) => k))) {
-      const piece = points.slice(Math.max(0, first - 1), last + 2);
+      const piece = points.slice(pieces * Math.max(0, first - 1), pieces * (last + 1) + 1);
       const red = piece.length > 1 ? tube(piece, 1.8 * this.thick, paint) : null;
       if (red) found.push(red);
     }
@@ -119,12 +129,11 @@ export class Flights {
 
   /** Move all vehicles to a time, s. */
   setTime(t) {
-    const all = this.knotsAt(t);
-    const now = this.phases[this.present(all)];
+    const now = this.phases[this.present(this.knotsAt(t))];
     for (const { flight, body, line, parts } of this.all) {
-      const knots = Math.max(0, all - (flight.phase?.first ?? 0));
+      const knots = Math.max(0, this.knotsAt(t, flight) - (flight.phase?.first ?? 0));
       body.visible = flight.phase === now;
-      const place = this.place(...between(flight.path, knots));
+      const place = this.place(...between(flight.way ?? flight.path, knots * (flight.pieces ?? 1)));
       body.position.copy(place);
       if (flight.attitude) body.quaternion.copy(attitude(flight.attitude, knots));
       const k = Math.min(Math.floor(knots), flight.path.rows - 1);

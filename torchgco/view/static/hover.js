@@ -23,7 +23,7 @@ export function pick(flights, camera, x, y, width, height) {
 export function linesOf({ name, flight, points, k }, flights) {
   const { head } = flights;
   const place = points[k].toArray().slice(0, head.dimension);
-  const lines = [`${name}, knot ${k}, t = ${flights.timeOf(k + (flight.phase?.first ?? 0)).toFixed(2)} s`];
+  const lines = [`${name}, knot ${k}, t = ${flights.timeOf(k + (flight.phase?.first ?? 0), flight).toFixed(2)} s`];
   lines.push(`at (${place.map((value) => value.toFixed(2)).join(", ")}) m`);
   lines.push(...flight.rows.map(([label, text]) => `${label}: ${text}`));
   const here = flight.violated.find(([knot]) => knot === k);
