@@ -245,9 +245,8 @@ def test_a_bad_state_is_no_step(folder: Path, bad: float) -> None:
 @pytest.mark.parametrize(
     ("parts", "options", "told"),
     [
-        ((RateBounds(-1.0, 1.0),), {}, r"constraints\[1\].*RateBounds"),
+        ((RateBounds(-1.0, 1.0, previous=0.0),), {}, "rate_bounds.previous"),
         ((Integral(lambda x, u: u.square().sum(-1), most=3.0),), {}, "Integral"),
-        ((torchgco.Link(knots=(2, 5), components=[0]),), {}, "Link"),
         ((torchgco.Gates([[0.5, 0.2]], radius=0.3),), {}, "Gates"),
         ((), {"changes": ["weight"]}, "time.weight"),
     ],

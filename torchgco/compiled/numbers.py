@@ -208,6 +208,11 @@ class KeptCarried(KeptLifted):
         """What solves are given."""
         return self.whole
 
+    @property
+    def carried(self) -> Tensor:
+        """What is carried at the start, (B, r)."""
+        return self.problem.x0[:, self._first :]
+
     def copies(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """See `Kept`: those of the user's states and controls."""
         (X, U, K, status, iterations), n, m = super().copies(), self.user.n, self.user.m

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from torchgco.compiled import Compiled
+from torchgco.compiled.stages import previous_of
 from torchgco.export.beginning import Beginning
 from torchgco.export.numbers import Changing
 from torchgco.export.source import Solver
@@ -21,6 +22,9 @@ FIXED_NOTE = "- `stages` is by how many stages of {} s time has gone on since th
 FREE_NOTE = """\
 - The third argument is the time since the last step, s. `w.t` has the times of the plan's knots, s, and u is the plan's
   mean over `w.period`, s: set it to yours. The first step begins with a plan that was found when this was written."""
+RATES_NOTE = """\
+- Rates count from `w.numbers.previous`, in which each step leaves the controls that it returned: where the vehicle did
+  something else, write that there. A step of no time, for the same states, counts from where the one before did."""
 ELEMENTS_NOTE = """\
 - There are {} elements: `NAME_init(&w, 0)` to `NAME_init(&w, {})` load the numbers of one of them."""
 
@@ -74,9 +78,18 @@ class Exported:
         return {
             "SAME": same, "REAL": real, "FIRST": ", 0" if many else "",
             "MOVED": "workspace.t[1]" if free else "NAME_STAGES", "USUAL": "NAME_PERIOD" if free else "NAME_STAGES",
-            "NOTES": "\n".join([FREE_NOTE if free else FIXED_NOTE.format(self.stage)] + [elements] * many),
+            "NOTES": "\n".join(
+                [FREE_NOTE if free else FIXED_NOTE.format(self.stage)]
+                + [RATES_NOTE] * bool(self.previous)
+                + [elements] * many
+            ),
             "GUESSED": ", t" * free,
         }  # fmt: skip
+
+    @property
+    def previous(self) -> list[str]:
+        """The names of numbers in which each step leaves its controls."""
+        return previous_of(self.problem) if self.receding else []
 
     @property
     def sizes(self) -> tuple[int, int, int]:

@@ -12,7 +12,9 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_value
 from torchgco.compiled import Compiled, compile
 from torchgco.compiled.motion import Motion
+from torchgco.compiled.stages import check_loop_in_free_time, previous_of
 from torchgco.constraints.gates import has_gates
+from torchgco.constraints.link import Integral
 from torchgco.export.beginning import beginning
 from torchgco.export.exported import Exported
 from torchgco.export.files import Build, write_files
@@ -85,7 +87,7 @@ def export_c(
     else:
         compiled = compile(_checked(problem), "interior_point")
     kept = _served(compiled, receding)
-    places = Motion(compiled.problem).places if receding else []
+    places = [*Motion(compiled.problem).places, *previous_of(compiled.problem)] if receding else []
     if changes is not None:
         changes = list(dict.fromkeys(compiled.numbers.find(name).name for name in [*changes, *places]))
     some = changing(kept, compiled, changes)
@@ -93,7 +95,7 @@ def export_c(
         raise InputError("problem", "obstacles whose places C reads as they are, where they move", lacking[0])
     with torch.no_grad():
         begin = beginning(compiled.now, kept.problem.m)
-    solver = solver_source(kept, some, compiled.interior, begin, BYTES[dtype])
+    solver = solver_source(kept, some, compiled.interior, begin, BYTES[dtype], receding)
     exported = Exported(compiled, kept, solver, some, begin, name, receding, BYTES[dtype])
     return write_files(exported, Path(folder), build)
 
@@ -114,10 +116,8 @@ def _checked(problem: Problem) -> Problem:
     if problem.horizon is not None:
         raise InputError("problem.horizon", "None in exported C", type(problem.horizon).__name__)
     for i, part in enumerate(problem.constraints):
-        if part.joins_knots:
-            raise InputError(
-                f"constraints[{i}]", "one without RateBounds, Link and Integral in exported C", type(part).__name__
-            )
+        if isinstance(part, Integral):
+            raise InputError(f"constraints[{i}]", "one without Integral in exported C", "Integral")
     return problem
 
 
@@ -126,6 +126,8 @@ def _served(compiled: Compiled, receding: bool) -> Kept:
     problem = _checked(compiled.problem)
     if receding and has_gates(problem):
         raise InputError("problem", "one without Gates unless receding=False: a loop would put them off", "Gates")
+    if receding and problem.time is not None:
+        check_loop_in_free_time(problem, 0.0)
     kept = compiled._kept
     if kept is None:
         kernels = interior_of(current(for_solvers(problem)))  # raises, or warns, what is missing

@@ -46,7 +46,7 @@ def periods_of(exported: Exported) -> Periods:
     """Those of each element in Python, as long as they converge."""
     free, begin, B = exported.is_free, exported.begin, exported.problem.B
     compiled = compile(
-        exported.compiled.now, "interior_point", ["x0"], exported.receding and not free,
+        exported.compiled.now, "interior_point", ["x0", *exported.previous], exported.receding and not free,
         exported.compiled.interior.tolerance,
     )  # fmt: skip
     elapsed = exported.period
@@ -63,6 +63,7 @@ def periods_of(exported: Exported) -> Periods:
         if not runs.any():
             break
         u = _controls(compiled, exported, answer)
+        compiled.numbers.write(dict.fromkeys(exported.previous, u))
         plans.append(answer.U[torch.from_numpy(runs)].flatten(0, 1).numpy())
         for b in runs.nonzero()[0].tolist():
             each[b].states.append(x[b])

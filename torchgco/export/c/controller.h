@@ -41,7 +41,7 @@ typedef struct {
     /* The solver's own: where it begins, and room that only a step needs. */
     int begun, able;
     double x[@SIZE_x@], u[@SIZE_u@];
-@MULTIPLIERS@
+@MULTIPLIERS@@BEFORE@
     double room[@ROOM@];
 } NAME_workspace;
 
