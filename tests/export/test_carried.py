@@ -123,6 +123,30 @@ def test_steps_have_the_bits_of_python(kind: str, tmp_path: Path) -> None:
         x = answer.X[0, min(1, problem.N)].numpy() + 2e-3 * draws.standard_normal(len(x))
 
 
+@pytest.mark.parametrize("period", [0.05, 0.07, 0.1, 0.15])
+def test_rates_are_those_of_time_in_periods_shorter_than_a_stage(period: float, tmp_path: Path) -> None:
+    """As of MPC: else they could change in every period by as much as in a stage."""
+    c = load_c(torchgco.export_c(gentle(), tmp_path, "car", period=period))
+    mpc = MPC(gentle(), "interior_point", period, max_seconds=INF)
+    assert c.period == pytest.approx(period)
+    x, share = np.array(START), min(1.0, period / 0.1)
+    for k in range(12):
+        before = c.numbers["previous"].copy()
+        v, u = mpc.step(x, x_ref=reference(period * k)), c.step(x, x_ref=reference(period * k))
+        assert torch.equal(u, v) and c.status == mpc.statuses[0] == Status.CONVERGED, k
+        change = u.numpy() - before
+        assert (change <= share * RISE + 1e-6).all() and (change >= share * FALL - 1e-6).all()
+        x = x + period * np.array([x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(u[1]) / 2.5, u[0]])
+    assert "double constraints_2_upper[" + ("24]" if share < 1 else "2]") in (tmp_path / "car.h").read_text()
+
+
+@pytest.mark.parametrize("options", [{"period": 0.0}, {"period": "1"}, {"period": 0.1, "receding": False}])
+def test_periods_that_are_none(options: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="period"):
+        torchgco.export_c(gentle(), tmp_path / "folder", **options)
+    assert not (tmp_path / "folder").exists()
+
+
 def member(c: torchgco.LoadedController, name: str) -> str:
     long = name.replace("[", "_").replace("].", "_")
     return long if long in c.numbers else name.rpartition(".")[2]
@@ -336,7 +360,8 @@ def test_what_a_loop_in_free_time_refuses(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("problem", [gentle, KINDS["two links and rates"], several, timed_rates, KINDS["a free start"]])
 def test_its_own_test_and_example_pass_without_a_warning(problem: Any, tmp_path: Path) -> None:
-    folder, count = exported(problem(), tmp_path), 40 * problem().B
+    period = 0.06 if problem is several else None
+    folder, count = torchgco.export_c(problem(), tmp_path, "car", period=period), 40 * problem().B
     flags = *STRICT, "-O1", "-g", "-march=native", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
     said("gcc", *flags, "car.c", "car_test.c", "-lm", "-o", tmp_path / "run", folder=folder)
     assert said(tmp_path / "run", folder=folder).startswith(SAME.replace("40", str(count)))

@@ -110,6 +110,20 @@ def test_numbers_change_between_steps_as_in_python(folder: Path, seed: int) -> N
         assert torch.equal(c.times, answer.t[0]) and c.workspace.iterations == int(answer.iterations[0]), name
 
 
+def test_references_change_up_to_the_last_knot(tmp_path: Path) -> None:
+    problem = TIMES["a path"]()
+    c, compiled, u = load_c(exported(problem, tmp_path)), torchgco.compile(problem, "interior_point"), np.zeros(2)
+    x = problem.x0[0].numpy()
+    compiled(x0=x)
+    c.step(x)
+    begin_alike(c, compiled)
+    c.workspace.period = 0.0
+    c.numbers["x_ref"][...] += [0.0, 0.2, 0.0, 0.0]
+    answer = compiled(x_ref=c.numbers["x_ref"].copy())
+    assert c.raw_step(x, 0.0, np.inf, u) == int(answer.status[0]) == Status.CONVERGED
+    assert torch.equal(c.plan[0], answer.X[0]) and torch.equal(c.times, answer.t[0])
+
+
 @pytest.mark.parametrize("name", ["least", "most"])
 def test_bounds_of_time_that_cross_are_refused(folder: Path, name: str) -> None:
     c, x = load_c(folder), np.array([-1.0, 0.0, 0.0, 0.0])

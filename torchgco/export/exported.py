@@ -14,6 +14,7 @@ from torchgco.export.numbers import Changing
 from torchgco.export.source import Solver
 from torchgco.native.interior import Kept
 from torchgco.problem.problem import Problem
+from torchgco.receding.plan import stages_between
 
 NEAR = 1e-3  # of the range of controls along the test's plans, that those in single precision may differ from Python's
 
@@ -41,6 +42,7 @@ class Exported:
     name: str
     receding: bool
     number: int  # bytes of a number: 8 or 4
+    seconds: float | None = None  # from one step to the next; None: a stage
 
     @property
     def problem(self) -> Problem:
@@ -59,14 +61,20 @@ class Exported:
         return f"{p.n} states, {p.m} controls, {p.N} stages{free}{many}"
 
     @property
-    def stage(self) -> str:
+    def dt(self) -> float:
         """The length of a stage, s."""
-        return f"{float(torch.as_tensor(self.problem.dynamics.dt).flatten()[0]):g}"
+        return float(torch.as_tensor(self.problem.dynamics.dt).flatten()[0])
+
+    @property
+    def stage(self) -> str:
+        """The same as text."""
+        return f"{self.dt:g}"
 
     @property
     def period(self) -> float:
         """By how much the horizon moves from step to step: stages, or seconds where the time is free."""
-        return float(self.receding) * (float(self.stage) if self.is_free else 1.0)
+        seconds = self.receding * (self.dt if self.seconds is None else self.seconds)
+        return float(seconds if self.is_free else stages_between(seconds / self.dt))
 
     @property
     def words(self) -> dict[str, Any]:

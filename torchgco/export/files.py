@@ -94,8 +94,8 @@ def write_files(exported: Exported, folder: Path, build: Build) -> Path:
         "FILES": (HERE / f"{build}.md").read_text().rstrip(),  # before the others: it has marks of its own
         "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
         "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.problem.x0[0]),
-        "EXAMPLE": EXAMPLE, "PERIODS": len(periods), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
-        "STACK": STACK + SPARE,
+        "EXAMPLE": EXAMPLE, "PERIODS": len(periods), "STACK": STACK + SPARE,
+        "MILLISECONDS": max(1, round(1e3 * (exported.seconds or exported.dt))),
         **exported.words,
     }  # fmt: skip
     files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}

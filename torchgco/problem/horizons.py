@@ -42,9 +42,7 @@ def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
     return within if joins_knots else with_carried(within)
 
 
-def states_for_solvers(
-    problem: Problem, X: Tensor, U: Tensor, factors: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def states_for_solvers(problem: Problem, X: Tensor, U: Tensor, factors: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """States X (B, N+1, n) and controls U (B, N, m) of a problem as those of its form `for_solvers`.
 
     Args:
