@@ -61,6 +61,24 @@ def test_contact_between_knots_comes_with_one_warning_that_names_the_problems() 
     assert (frame.clearance < 0).tolist() == [i in (1, 3, 4, 5, 6, 7) for i in range(8)]
 
 
+def with_rates(problem: Problem) -> Problem:
+    return replace(problem, constraints=[*problem.constraints, RateBounds(-50.0, 50.0, previous=0.0)])
+
+
+@compiled
+@pytest.mark.filterwarnings("error::torchgco.kernels.choice.EagerWarning")
+def test_contact_beside_limited_rates_is_measured_by_the_solvers_own_kernels() -> None:
+    """Rows of two knots can't be compiled as the user gives them, and distances don't ask for them."""
+    problem = with_rates(row_of_discs())
+    with pytest.warns(ContactWarning, match="6 of 8"):
+        torchgco.solve(problem, solver=FAST)
+    mpc = torchgco.MPC(problem, period=0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactWarning)
+        mpc.step(problem.x0)
+    assert mpc.feasible.shape == (8,)
+
+
 @compiled
 def test_no_warning_without_contact() -> None:
     with warnings.catch_warnings():

@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -60,6 +60,7 @@ class Owned:
     radius: float
     source: str
     resolution: float | None = None
+    outside: Literal["free", "occupied"] | None = None
 
 
 NAVIGATION = "ros-navigation/navigation2 a3a9704, Apache-2.0"
@@ -170,7 +171,8 @@ def short(table: str) -> str:
 
 def map_rows(folder: Path, owned: Owned, solvers: Sequence[str]) -> list[list[Any]]:
     """The flights on a real map, with stages by the way."""
-    options: dict[str, Any] = {} if owned.resolution is None else {"resolution": owned.resolution}
+    named: dict[str, Any] = {"resolution": owned.resolution, "outside": owned.outside}
+    options = {name: value for name, value in named.items() if value is not None}
     ends: dict[str, Any] = {"start": owned.start, "goal": owned.goal}
     layouts = MapFile(folder / owned.file, vehicle_radius=owned.radius, **ends, **options).draw([0], 0)
     task = torchgco.compose(["scenario=floors", "device.threads=1"]).vehicle.task(layouts)

@@ -74,8 +74,8 @@ CASES = {
             "mission.explorer.region=[[-2,18],[-2,14],[-1.5,4.5]]", *ALL_AROUND,
         ), 4,
     ),
-    **{f"{count} moving, known": Case(_moving(count, "known"), 3, at_rest=False) for count in (50, 100, 200)},
-    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 3, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, known": Case(_moving(count, "known"), 32, at_rest=False) for count in (50, 100, 200)},
+    **{f"{count} moving, seen": Case(_moving(count, "tracked"), 32, at_rest=False) for count in (50, 100, 200)},
 }  # fmt: skip
 HEAD = (
     "world", "n", *(outcome.name for outcome in Outcome), "safe periods", "flight time", "clearance", "speed",
@@ -126,11 +126,11 @@ def table(trials: pd.DataFrame, log: pd.DataFrame) -> str:
     return markdown(HEAD, lines)
 
 
-def short(table: str, misses: str) -> str:
+def short(name: str, table: str, misses: str) -> str:
     """Both tables as files, and a short form of the first."""
-    missed = filed("unknown-misses", misses) if misses.startswith("|") else misses
+    missed = filed(f"{name}-misses", misses) if misses.startswith("|") else misses
     few = chosen(table, (*HEAD[:5], "flight time", "clearance"))
-    return f"{filed('unknown', table, few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
+    return f"{filed(name, table, few)}\n\nMissions that missed, or were without a safe plan:\n\n{missed}"
 
 
 def misses(trials: pd.DataFrame, log: pd.DataFrame) -> str:
@@ -176,17 +176,20 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--outputs", type=Path, default=ROOT / "outputs" / "unknown")
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/results/maps.md")
     asked = parser.parse_args(words)
-    tables = [fly(name, asked.count or CASES[name].count, asked.outputs) for name in asked.cases]
-    trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
-    head = f"{origin('Flown')}, seed 0, {machine()}."
-    blocks = {
-        "worlds": f"{head}\n\n{short(table(trials, log), misses(trials, log))}",
-        "times": times(log),
-    }
-    for name, text in blocks.items():
-        print(text)
-        if asked.write:
-            put(RESULTS / "maps.md", name, text)
+    for mark, file, at_rest in (("worlds", "unknown", True), ("moving", "unknown-moving", False)):
+        names = [name for name in asked.cases if CASES[name].at_rest == at_rest]
+        if not names:
+            continue
+        tables = [fly(name, asked.count or CASES[name].count, asked.outputs) for name in names]
+        trials, log = (pd.concat(parts, ignore_index=True) for parts in zip(*tables, strict=True))
+        head = f"{origin('Flown')}, seed 0, {machine()}."
+        blocks = {mark: f"{head}\n\n{short(file, table(trials, log), misses(trials, log))}"}
+        if at_rest:
+            blocks["times"] = times(log)
+        for name, text in blocks.items():
+            print(text)
+            if asked.write:
+                put(RESULTS / "maps.md", name, text)
     return 0
 
 

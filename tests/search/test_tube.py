@@ -39,7 +39,7 @@ RADIUS = 0.25
 UNICYCLE = Unicycle(dt=0.1)
 
 
-def room(walls: float = 0.4, B: int = 2, N: int = 110, model: Dynamics = UNICYCLE) -> Problem:
+def room(walls: float = 0.4, B: int = 2, N: int = 110, model: Dynamics = UNICYCLE, radius: float = RADIUS) -> Problem:
     """Rooms beside each other, joined by a door at the far end of a thick wall between start and goal."""
     cells = np.zeros((80, 60), bool)
     cells[[0, -1]], cells[:, [0, -1]] = True, True
@@ -47,7 +47,7 @@ def room(walls: float = 0.4, B: int = 2, N: int = 110, model: Dynamics = UNICYCL
     cells[38 : 38 + thick, :46] = True
     start = torch.tensor([[1.5, 1.5, 0.5 * b, 0.0] for b in range(B)], dtype=D)
     cost = QuadraticCost(Q=[0.1, 0.1, 0, 2], R=[0.5, 0.5], Qf=[200, 200, 0, 10], x_ref=[6.3, 1.5, 0, 0])
-    rows = [Field(OccupancyGrid(cells, [0.0, 0.0], 0.1), RADIUS), ControlBounds([-2, -1.5], [2, 1.5])]
+    rows = [Field(OccupancyGrid(cells, [0.0, 0.0], 0.1), radius), ControlBounds([-2, -1.5], [2, 1.5])]
     return Problem(model, cost, rows, start, N, Goal([6.3, 1.5], 0.3))
 
 
@@ -72,6 +72,14 @@ def test_it_arrives_behind_a_thick_wall_of_a_map(model: Dynamics) -> None:
     found = judge(problem, alone(problem, Tube("maps")).solve(problem, rest(problem)).U)
     assert bool((found.clear_95 & (found.goal_distance < 0.3)).all()), "nothing clears the ways between the knots"
     assert bool(judge(problem, solve(problem).U).reached.all())
+
+
+@pytest.mark.sampled(1)
+def test_it_arrives_where_steps_are_longer_than_the_vehicle_is_wide() -> None:
+    """Every candidate cuts a corner between two knots by most of the vehicle's width, and can be brought clear."""
+    problem = room(N=50, radius=0.01)
+    verdict = judge(problem, solve(problem).U)
+    assert bool(verdict.reached.all()) and float(verdict.cost.max()) < 210.0
 
 
 @MODELS

@@ -27,7 +27,7 @@ from torchgco.kernels import current, held_on_cpu, is_mixed, open_loop, path_cle
 from torchgco.lagrangian.lagrangian import shifted
 from torchgco.phases import Phases
 from torchgco.problem.alone import check_rows
-from torchgco.problem.in_time import at_times
+from torchgco.problem.horizons import as_solved
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, clamped, held
 from torchgco.receding.plan import Plan, stages_between
@@ -158,7 +158,7 @@ class MPC:
         if rows.numel() > 0 and self.answer is not None:
             times = None if self.answer.t is None else self.answer.t[rows]
             with torch.no_grad(), torch.inference_mode(False), computing_on(CPU):
-                now = at_times(self.compiled.now.take(rows), self.answer.X[rows], self.answer.U[rows], times)
+                now = as_solved(self.compiled.now.take(rows), self.answer.X[rows], self.answer.U[rows], times)
                 if all(obstacles.has_chords for obstacles in now[0].obstacles):
                     self._feasible[rows.numpy()] = (path_clearance(*now) >= 0).numpy()
         self._unlooked[:] = False

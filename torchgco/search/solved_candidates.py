@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchgco.base.status import Status
-from torchgco.base.tree import take
+from torchgco.base.tree import put, take
 from torchgco.kernels import chord_clearance, measured, open_loop
 from torchgco.lagrangian.lagrangian import Iterate, Multipliers, SolveEnd
 from torchgco.lagrangian.quality import has_arrived, leaves_goal, outside_goal
@@ -27,7 +27,7 @@ from torchgco.search.search import Search, is_sound
 from torchgco.solvers.interior import InteriorPoint
 
 LAST_DEPTH = 0.8  # depth in an obstacle, in R, of candidates that come after all others
-CUT = 0.3  # depth between two knots, in R, of solved ones that don't count: a step through a wall can't be repaired
+CUT = 0.3  # depth between two knots, in R, of solved ones that don't count beside others: that may be through a wall
 # From a trajectory that is clear, a barrier of 0.1 leads into other classes; the last row of a table goes on from here.
 SOLVER = InteriorPoint(tolerance=1e-4, max_iterations=300, initial_barrier=1e-3)
 SAME = 1e-3  # share of the cost by which solved candidates of one way differ
@@ -51,15 +51,16 @@ def in_order(candidates: Candidates) -> Tensor:
 def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | None = None) -> Refined:
     """Every chosen candidate solved; of each problem in `rows` the best that is feasible and arrives is kept.
 
-    None that steps over an obstacle from one knot to the next counts. Obstacles have `grown` (b,), m, for the solves.
+    None that steps over an obstacle from one knot to the next counts; where that leaves none, they are solved again
+    among larger obstacles. Obstacles have `grown` (b,), m, for the solves.
     """
     problem, limit = chosen.problem, search.solver.violation_tolerance
     finite = [torch.isfinite(part).flatten(1).all(-1) for part in (chosen.X, chosen.U)]
     some = (chosen.live & finite[0] & finite[1]).nonzero().flatten()
-    cost, made = torch.full_like(chosen.unit, torch.inf), chosen.iterations
+    made = chosen.iterations
     multipliers = Multipliers(tuple(chosen.U.new_zeros(0, *s) for s in problem.row_shapes), chosen.unit)
     if some.numel() == 0:
-        return Refined(chosen, multipliers, some.new_zeros(problem.B), cost)
+        return Refined(chosen, multipliers, some.new_zeros(problem.B), torch.full_like(chosen.unit, torch.inf))
     call = replace(search.call.take(rows[some // chosen.count]), U0=chosen.U[some], warm=None, callback=None)
     if grown is None:
         end = solved_nearby(SOLVER, call, chosen.X[some])
@@ -67,13 +68,15 @@ def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | Non
         larger = replace(call, problem=call.problem.grown(grown[some // chosen.count]))
         end = solved_nearby(SOLVER, larger, chosen.X[some])
         end = replace(end, best=replace(end.best, violation=measured(call.problem, end.best.X, end.best.U)))
+    cost, clear = _merits(call.problem, end, chosen, some, limit)
+    without = ~torch.isfinite(cost.view(problem.B, -1)).any(1)
+    touching = (without[some // chosen.count] & _fits(call.problem, end, limit)).nonzero().flatten()
+    if touching.numel() > 0 and not call.late:  # steps are longer than the vehicle is wide
+        again = take(end, touching)
+        clear_further(search, call.take(touching), again)
+        put(end, touching, again)
+        cost, clear = _merits(call.problem, end, chosen, some, limit)
     made = made.index_add(0, some // chosen.count, end.iterations)
-    fits = ((end.best.violation <= limit) & has_arrived(call.problem, end.best.X)).nonzero().flatten()
-    clear = cost.clone()
-    if fits.numel() > 0:  # others may end anywhere
-        clearance = chord_clearance(call.problem.take(fits), end.best.X[fits])
-        for merit, least in ((cost, -CUT * chosen.R[some[fits]]), (clear, torch.zeros_like(clearance))):
-            merit[some[fits]] = torch.where(clearance >= least, end.best.cost[fits], torch.inf)
     for merit in (clear, cost):  # the cheapest that is clear between knots, too, is remembered by `Best.keep`
         _keep(search, rows, chosen.count, some, end, merit, made)
         made = torch.zeros_like(made)
@@ -83,6 +86,26 @@ def solved(search: Search, rows: Tensor, chosen: Candidates, grown: Tensor | Non
     X, U = chosen.X.clone(), chosen.U.clone()
     X[some], U[some] = end.best.X, end.best.U
     return Refined(replace(chosen, X=X, U=U), multipliers, best, cost)
+
+
+def _fits(problem: Problem, end: SolveEnd, limit: float) -> Tensor:
+    """Which solved candidates keep all rows at the knots and arrive, (b,) bool."""
+    return (end.best.violation <= limit) & has_arrived(problem, end.best.X)
+
+
+def _merits(problem: Problem, end: SolveEnd, chosen: Candidates, some: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """The costs (B * count,) of candidates, infinite where one doesn't count, and of those alone that are clear.
+
+    Args:
+        end: how candidates `some` (b,) have ended.
+    """
+    cost = torch.full_like(chosen.unit, torch.inf)
+    clear, fits = cost.clone(), _fits(problem, end, limit).nonzero().flatten()
+    if fits.numel() > 0:  # others may end anywhere
+        clearance = chord_clearance(problem.take(fits), end.best.X[fits])
+        for merit, least in ((cost, -CUT * chosen.R[some[fits]]), (clear, torch.zeros_like(clearance))):
+            merit[some[fits]] = torch.where(clearance >= least, end.best.cost[fits], torch.inf)
+    return cost, clear
 
 
 def solve_cheapest(

@@ -19,7 +19,7 @@ from torchgco.judging.gates import passages
 from torchgco.kernels import cost_scale, cost_unit, kernels_of, measured, path_clearance
 from torchgco.lagrangian.lagrangian import Lagrangian, PassEnd, State, binding
 from torchgco.obstacles.base import ADMITTED
-from torchgco.problem.in_time import at_times
+from torchgco.problem.horizons import as_solved
 from torchgco.problem.problem import Problem
 from torchgco.solution import Solution
 
@@ -155,7 +155,7 @@ def touches(problem: Problem, solution: Solution) -> Tensor:
     rows = touching.nonzero().flatten()
     if rows.numel() > 0:
         times = None if solution.times is None else solution.times[rows]
-        touching[rows] = path_clearance(*at_times(problem.take(rows), solution.X[rows], solution.U[rows], times)) < 0
+        touching[rows] = path_clearance(*as_solved(problem.take(rows), solution.X[rows], solution.U[rows], times)) < 0
     return touching
 
 
