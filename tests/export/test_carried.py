@@ -14,6 +14,8 @@ import torchgco
 from tests.export.exported import M4F, M7, SAME, STRICT, exported, needs, needs_compiler, on_board, said
 from tests.export.free import timed
 from tests.export.kinds import CAR, START, N, car, point, reference
+from tests.export.test_free_time import begin_alike
+from tests.export.test_stack import DESKTOP, frames
 from torchgco import (
     MPC,
     ControlBounds,
@@ -29,6 +31,7 @@ from torchgco import (
     load_c,
 )
 from torchgco.constraints.bounds import rates_of
+from torchgco.export.files import STACK
 
 pytestmark = [
     needs_compiler,
@@ -85,7 +88,8 @@ KINDS: dict[str, Callable[[], Problem]] = {
     "free at first": lambda: car(FAR, RateBounds(FALL, RISE)),
     "one stage": lambda: Problem(
         CAR, QuadraticCost([1, 1, 0.1, 0.1], [0.1, 1], [10, 10, 1, 1], [0.4, 0.1, 0.0, 3.5]),
-        [ControlBounds([-3.0, -0.5], [3.0, 0.5]), RateBounds(FALL, RISE, previous=[0.0, 0.0])], START, 1,
+        [ControlBounds([-3.0, -0.5], [3.0, 0.5]), RateBounds(FALL, RISE, previous=[0.0, 0.0])],
+        torch.tensor([START]).double(), 1,
     ),
     "speed": lambda: car(StateBounds(-INF, [INF, INF, INF, 3.2]), RateBounds(-0.3, 0.3, previous=0.0)),
     "a link": lambda: point(Link(knots=(3, 8), components=[3, 1])),
@@ -134,9 +138,10 @@ def test_rates_are_those_of_time_in_periods_shorter_than_a_stage(period: float, 
         before = c.numbers["previous"].copy()
         v, u = mpc.step(x, x_ref=reference(period * k)), c.step(x, x_ref=reference(period * k))
         assert torch.equal(u, v) and c.status == mpc.statuses[0] == Status.CONVERGED, k
+        a, steering = u.numpy()
         change = u.numpy() - before
         assert (change <= share * RISE + 1e-6).all() and (change >= share * FALL - 1e-6).all()
-        x = x + period * np.array([x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(u[1]) / 2.5, u[0]])
+        x = x + period * np.array([x[3] * np.cos(x[2]), x[3] * np.sin(x[2]), x[3] * np.tan(steering) / 2.5, a])
     assert "double constraints_2_upper[" + ("24]" if share < 1 else "2]") in (tmp_path / "car.h").read_text()
 
 
@@ -157,8 +162,8 @@ def test_failing_steps_hold_the_plan_within_bounds_and_rates_as_mpc_does(folder:
     c, mpc = load_c(folder), MPC(gentle(), "interior_point")
     x, last = np.array(START), np.zeros(2)
     for k in range(12):
-        late = {"max_seconds": 1e-9} if k in (2, 3, 4, 8) else {"max_seconds": INF}
-        told = {"previous": last + np.array([0.5, -0.5])} if k == 4 else {}  # the vehicle did something else
+        late: Any = {"max_seconds": 1e-9} if k in (2, 3, 4, 8) else {"max_seconds": INF}
+        told: Any = {"previous": last + np.array([0.5, -0.5])} if k == 4 else {}  # the vehicle did something else
         planned = c.plan[1][min(int(c.workspace.age) + 1, N - 1)].numpy()
         v, u = mpc.step(x, **late, **told), c.step(x, **late, **told)
         assert c.status == mpc.statuses[0] and c.held == bool(mpc.held) == (k in (2, 3, 4, 8))
@@ -314,7 +319,7 @@ def test_elements_have_rates_of_their_own(which: str, tmp_path: Path) -> None:
     x, draws, rates = several().x0.numpy(), np.random.default_rng(0), rates_of(several().constraints)
     assert rates is not None
     for k in range(12):
-        late = {"max_seconds": 1e-9 if k in (4, 5) else INF}
+        late: Any = {"max_seconds": 1e-9 if k in (4, 5) else INF}
         v = mpc.step(x, **late)
         for b, c in enumerate(each):
             before = c.numbers["previous"].copy()
@@ -331,8 +336,6 @@ def timed_rates() -> Problem:
 
 
 def test_a_free_time_has_rates(tmp_path: Path) -> None:
-    from tests.export.test_free_time import begin_alike
-
     c, compiled = load_c(exported(timed_rates(), tmp_path)), torchgco.compile(timed_rates(), "interior_point")
     x, draws, u = timed_rates().x0[0].numpy(), np.random.default_rng(1), np.zeros(2)
     answer = compiled(x0=x)
@@ -369,6 +372,11 @@ def test_its_own_test_and_example_pass_without_a_warning(problem: Any, tmp_path:
     assert said(tmp_path / "run", folder=folder).count("status 1") >= 19
 
 
+@needs("gcc")
+def test_a_step_takes_at_most_the_stack_that_the_page_says(folder: Path) -> None:
+    assert frames(folder, "-Os", DESKTOP) <= STACK
+
+
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m7(folder: Path, tmp_path: Path) -> None:
     assert on_board(M7, "-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run").startswith(SAME)
@@ -384,7 +392,7 @@ def test_single_precision(problem: Any, tmp_path: Path) -> None:
     assert said(tmp_path / "run", folder=folder).startswith(f"{count} of {count} periods have controls within 0.001")
     c, mpc, x = load_c(folder), MPC(problem(), "interior_point"), problem().x0.numpy()
     for k in range(6):
-        late = {"max_seconds": 1e-9 if k == 3 else INF}
+        late: Any = {"max_seconds": 1e-9 if k == 3 else INF}
         u, v = c.step(x[0], **late), mpc.step(x, **late).reshape(-1, 2)[0]
         torch.testing.assert_close(u, v, rtol=0, atol=1e-2)
         assert mpc.answer is not None

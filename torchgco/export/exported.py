@@ -63,7 +63,7 @@ class Exported:
     @property
     def dt(self) -> float:
         """The length of a stage, s."""
-        return float(torch.as_tensor(self.problem.dynamics.dt).flatten()[0])
+        return float(torch.as_tensor(self.problem.dynamics.dt, dtype=torch.float64).flatten()[0])
 
     @property
     def stage(self) -> str:

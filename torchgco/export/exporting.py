@@ -112,17 +112,15 @@ def _check_options(name: Any, build: Any, dtype: Any, receding: Any, period: Any
 
 def _compiled(problem: Problem | Compiled, period: float | None) -> Compiled:
     """The problem as it is now, for the interior point and steps of this period."""
-    asked, tolerance = problem, None
-    if isinstance(problem, Compiled):
-        asked, tolerance = problem.now, problem.interior.tolerance
-    asked = _checked(asked)
+    again = isinstance(problem, Compiled)
+    asked = _checked(problem.now if again else problem)
     if period is not None and asked.time is None and (share := period / stage_of(asked)) < 1.0:
         asked = in_periods(asked, share)
-    with served_by(*problem.origin) if isinstance(problem, Compiled) else nullcontext():
-        return compile(asked, "interior_point", tolerance=tolerance)
+    with served_by(*problem.origin) if again else nullcontext():
+        return compile(asked, "interior_point", tolerance=problem.interior.tolerance if again else None)
 
 
-def _checked(problem: Problem) -> Problem:
+def _checked(problem: Any) -> Problem:
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem, or what torchgco.compile makes of one", type(problem).__name__)
     if problem.B == 0:
