@@ -143,7 +143,7 @@ class LoadedController:
         return torch.from_numpy(np.array(self._workspace.t)).double()
 
     def reset(self) -> None:
-        """Forget the plan; numbers stay."""
+        """Forget the plan; numbers stay, but for those that steps write."""
         self._functions["reset"](ctypes.byref(self._workspace))
         self.t, self._begun = 0.0, False
 

@@ -508,8 +508,8 @@ void NAME_reset(NAME_workspace *w) {
     w->begun = w->able = 0;
     w->status = RUNNING; w->held = w->warm = w->iterations = 0; w->violation = 0;
 #ifdef PREVIOUS
-    memcpy((double *)(void *)&w->numbers + PREVIOUS, (const double *)(const void *)(exported_numbers + unknown(ELEMENT(w))) + PREVIOUS,
-        sizeof w->before);
+    const double *exported = (const double *)(const void *)(exported_numbers + unknown(ELEMENT(w)));
+    memcpy((double *)(void *)&w->numbers + PREVIOUS, exported + PREVIOUS, sizeof w->before);
 #endif
 #if HAS_PLAN
     int e = ELEMENT(w);
