@@ -89,7 +89,7 @@ def test_references_of_fixed_times_change() -> None:
 
     def halves(there: float) -> Phases:
         rest = QuadraticCost([0.1, 0.1], [0.1], [5.0, 1.0], x_ref=[there, 0.0])
-        return Phases([Problem(BALL, cost, [], [1.0, 0.0], 10) for cost in (EFFORT, rest)])
+        return Phases([Problem(BALL, cost, [], torch.tensor([1.0, 0.0], dtype=D), 10) for cost in (EFFORT, rest)])
 
     fast = torchgco.compile(halves(1.0))
     fast()
