@@ -13,7 +13,18 @@ import torchgco
 from tests.export.exported import M7, SAME, STRICT, exported, needs, needs_compiler, on_board, said
 from tests.export.free import TIMES, timed
 from tests.slow import mostly
-from torchgco import InputError, Integral, LoadedController, RateBounds, Status, load_c
+from torchgco import (
+    ControlBounds,
+    FreeTime,
+    InputError,
+    Integral,
+    LoadedController,
+    Problem,
+    QuadraticCost,
+    RateBounds,
+    Status,
+    load_c,
+)
 
 pytestmark = [
     needs_compiler,
@@ -108,6 +119,22 @@ def test_numbers_change_between_steps_as_in_python(folder: Path, seed: int) -> N
         c.raw_step(x, 0.0, np.inf, u)
         assert answer.statuses == [Status.CONVERGED] and np.array_equal(u, answer.u[0].numpy()), name
         assert torch.equal(c.times, answer.t[0]) and c.workspace.iterations == int(answer.iterations[0]), name
+
+
+def test_references_change_up_to_the_last_knot(tmp_path: Path) -> None:
+    one = timed()
+    cost = QuadraticCost([0.1] * 4, [0.02] * 2, [5.0] * 4, x_ref=[2.0, 0.3, 0.0, 0.0])
+    problem = Problem(one.dynamics, cost, [ControlBounds(-2.0, 2.0)], one.x0, one.N, time=FreeTime(0.2, 4.0, 1.0))
+    c, compiled, u = load_c(exported(problem, tmp_path)), torchgco.compile(problem, "interior_point"), np.zeros(2)
+    x = problem.x0[0].numpy()
+    compiled(x0=x)
+    c.step(x)
+    begin_alike(c, compiled)
+    c.workspace.period = 0.0
+    c.numbers["x_ref"][...] += [0.0, 0.2, 0.0, 0.0]
+    answer = compiled(x_ref=c.numbers["x_ref"][None])
+    assert c.raw_step(x, 0.0, np.inf, u) == int(answer.status[0]) == Status.CONVERGED
+    assert torch.equal(c.plan[0], answer.X[0]) and torch.equal(c.times, answer.t[0])
 
 
 @pytest.mark.parametrize("name", ["least", "most"])
@@ -245,9 +272,8 @@ def test_a_bad_state_is_no_step(folder: Path, bad: float) -> None:
 @pytest.mark.parametrize(
     ("parts", "options", "told"),
     [
-        ((RateBounds(-1.0, 1.0),), {}, r"constraints\[1\].*RateBounds"),
+        ((RateBounds(-1.0, 1.0, previous=0.0),), {}, "rate_bounds.previous"),
         ((Integral(lambda x, u: u.square().sum(-1), most=3.0),), {}, "Integral"),
-        ((torchgco.Link(knots=(2, 5), components=[0]),), {}, "Link"),
         ((torchgco.Gates([[0.5, 0.2]], radius=0.3),), {}, "Gates"),
         ((), {"changes": ["weight"]}, "time.weight"),
     ],

@@ -98,6 +98,15 @@ def test_a_cortex_m4f(folder: Path, tmp_path: Path) -> None:
     assert told.startswith(NEAR)
 
 
+def test_the_horizon_moves_on_between_steps(folder: Path) -> None:
+    """By constants that C has as hexadecimal numbers."""
+    c, other, u = load_c(folder), load_c(folder), np.zeros(2, np.float32)
+    assert c.period == c.dt == 0.1
+    for moved in (0.0, 1.0):
+        other.raw_step(np.array(START, np.float32), moved, np.inf, u)
+        assert np.array_equal(c.step(START).numpy(), u)
+
+
 def test_guesses_numbers_and_held_plans_are_floats_too(folder: Path) -> None:
     c, problem = load_c(folder), discs()
     found = torchgco.solve(problem, solver="interior_point", verbose=False)

@@ -84,6 +84,20 @@ def test_a_call_with_other_numbers_is_a_solve_of_other_phases() -> None:
     torch.testing.assert_close(answer.u, answer[0].U[:, 0])
 
 
+def test_references_of_fixed_times_change() -> None:
+    """Which the whole has copies of."""
+
+    def halves(there: float) -> Phases:
+        rest = QuadraticCost([0.1, 0.1], [0.1], [5.0, 1.0], x_ref=[there, 0.0])
+        return Phases([Problem(BALL, cost, [], torch.tensor([1.0, 0.0], dtype=D), 10) for cost in (EFFORT, rest)])
+
+    fast = torchgco.compile(halves(1.0))
+    fast()
+    answer = fast(numbers={"phases[1].cost.x_ref": np.tile([2.0, 0.0], (1, 11, 1))})
+    assert bool(answer.warm.all())
+    same(answer, halves(2.0))
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["obstacles", "impulses", "free start", "a lap", "Python", "fixed times"])
 def test_kinds_of_phases(kind: str) -> None:

@@ -23,21 +23,22 @@ from torchgco.base.status import Status
 from torchgco.base.tree import put
 from torchgco.compiled.answer import Answer
 from torchgco.compiled.numbers import (
+    KeptCarried,
     KeptInTime,
     KeptLifted,
     Numbers,
-    kept_in_time,
+    kept_of,
     later,
     numbers_of,
     with_numbers_as_they_are,
     with_own_numbers,
 )
 from torchgco.explaining.explain import Account
-from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, is_mixed, served_by
+from torchgco.kernels import cost_unit, held_on_cpu, is_mixed, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
-from torchgco.native.interior import InteriorEngine, Kept
+from torchgco.native.interior import Kept
 from torchgco.phases import PhasesSolution
 from torchgco.problem.horizons import for_solvers
 from torchgco.problem.in_time import at_times
@@ -117,17 +118,11 @@ class Compiled:
     def _packed(self, problem: Any) -> None:
         if problem.B == 0:
             return
-        if problem.time is not None:
-            self._kept = kept_in_time(problem, self.interior.options(warm=True))
-            self._unit = self._unit if self._kept is None else cost_unit(self._kept.whole)
-            return
-        form = current(for_solvers(problem))
-        if for_solvers(problem) is problem:
-            kernels = interior_of(form)
-            # What Python has read of a problem's own numbers stays in the code.
-            if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
-                self._problem, self._unit = form, cost_unit(form)
-                self._kept = Kept(kernels, form, cost_scale(form), self.interior.options(warm=True))
+        self._kept = kept = kept_of(problem, self.interior.options(warm=True))
+        if kept is not None:
+            lifted = isinstance(kept, KeptCarried)
+            self._problem = problem if lifted else kept.problem
+            self._unit = cost_unit(kept.whole if lifted else kept.problem)
 
     def __call__(
         self,
@@ -265,7 +260,7 @@ class Compiled:
             self._begin(self._owning(problem))
 
     def _note(self, number: Number) -> None:
-        if number.derived or self._in_time:  # where it is, C has traced what it would read itself
+        if number.derived or isinstance(self._kept, KeptLifted):  # it has copies, or traced what it would read itself
             self._changed.add(number.part)
 
     def _refresh(self, shift: float = 0) -> None:

@@ -21,7 +21,7 @@ from torchgco.compiled.compiled import CONVERGED, FEASIBLE, Compiled
 from torchgco.compiled.compiling import compile
 from torchgco.compiled.motion import Motion
 from torchgco.compiled.numbers import Numbers, numbers_of, with_numbers_as_they_are, with_own_numbers
-from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, stage_of
+from torchgco.compiled.stages import check_loop_in_free_time, in_periods, previous_of, stage_of
 from torchgco.guidance.mppi import MPPI
 from torchgco.kernels import current, held_on_cpu, is_mixed, open_loop, path_clearance, served_by
 from torchgco.lagrangian.lagrangian import shifted
@@ -101,7 +101,7 @@ class MPC:
         self.max_seconds = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
-        self._previous = [f"constraints[{i}].previous" for i, c in enumerate(problem.constraints) if follows(c)]
+        self._previous = previous_of(problem)
         if self._previous and self.period < self.dt:
             asked, problem = (in_periods(one, self.period / self.dt) for one in (asked, problem))
         self._motion = Motion(problem)

@@ -20,7 +20,8 @@ from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.interior import InteriorEngine, Kept
 from torchgco.problem.goal import Goal, GoalBall, GoalState
-from torchgco.problem.in_time import Elapsed, factors_in, factors_of, in_time, states_in_time, times_of
+from torchgco.problem.horizons import for_solvers, states_for_solvers
+from torchgco.problem.in_time import Elapsed, factors_in, factors_of, states_in_time, times_of
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
 from torchgco.solution import Solution
@@ -165,7 +166,7 @@ class KeptLifted(Kept):
         self, kernels: InteriorEngine, problem: Problem, scale: CostScale, options: BarrierOptions, user: Problem
     ) -> None:
         super().__init__(kernels, problem, scale, options)
-        self._given, self._frees = user.x0.numpy(), user.time is not None
+        self._given, self._first = user.x0.numpy(), user.n + (user.time is not None)  # what is carried begins there
 
     def start(self) -> None:
         """See `Kept`; the factor of time is free, too."""
@@ -184,21 +185,73 @@ class KeptLifted(Kept):
         raise NotImplementedError
 
 
-class KeptInTime(KeptLifted):
-    """Kept problems with a free time: in the form `in_time` and, as in solves with a choice of time, in units of cost.
+class KeptCarried(KeptLifted):
+    """Kept problems with rows of two knots: in the form `with_carried`.
 
     Args:
         kernels: of this form.
         user: the problems, whose tensors are written to.
-        whole: the same `in_time`.
+        whole: the same in this form.
         options: see `Kept`.
     """
 
     def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
-        self.user, self.whole, self.unit = user, whole, cost_unit(whole)
-        super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options, user)
-        pairs = zip(user.constraints, whole.constraints, strict=False)
-        self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}
+        self.user, self.whole = user, whole
+        super().__init__(kernels, self._solved(), cost_scale(whole), options, user)
+        every = [("cost", user.cost), *enumerate(user.constraints)]
+        # Where the form has copies of a part's numbers: what is to be written, and read by C again.
+        self._copied_in: dict[str | int, list[str | int]] = {
+            i: [i] for i, part in every if getattr(part, "joins_knots", False) or _differ(part, _part(whole, i))
+        }
+
+    def _solved(self) -> Problem:
+        """What solves are given."""
+        return self.whole
+
+    @property
+    def carried(self) -> Tensor:
+        """What is carried at the start, (B, r)."""
+        return self.problem.x0[:, self._first :]
+
+    def copies(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """See `Kept`: those of the user's states and controls."""
+        (X, U, K, status, iterations), n, m = super().copies(), self.user.n, self.user.m
+        return X[..., :n].contiguous(), U[..., :m].contiguous(), K[..., :m, :n].contiguous(), status, iterations
+
+    def begin_at(self, rows: Tensor, X: Tensor, U: Tensor) -> None:
+        """See `Kept`: trajectories of the user's problems."""
+        super().begin_at(rows, *states_for_solvers(self.user.take(rows), X, U))
+
+    def take_over(self, rows: Tensor, solution: Solution) -> None:
+        """See `Kept`."""
+        X, _ = states_for_solvers(self.user.take(rows), solution.X, solution.U)
+        super().take_over(rows, replace(solution, X=X))
+
+    def read(self, changed: set[str | int], now: Problem) -> set[str | int]:
+        """See `KeptLifted`."""
+        places = {place for part in changed for place in self._copied_in.get(part, ())}
+        if not places:
+            return changed
+        new = for_solvers(now)
+        self._x0[:, self._first :] = new.x0[:, self._first :].numpy()
+        for place in places:
+            overwrite(_part(self.whole, place), _part(new, place))
+        return changed | places
+
+
+class KeptInTime(KeptCarried):
+    """Kept problems with a free time: in the form `in_time` and, as in solves with a choice of time, in units of cost.
+
+    Args: see `KeptCarried`.
+    """
+
+    def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
+        self.unit = cost_unit(whole)
+        super().__init__(kernels, user, whole, options)
+        self._copied_in["time"] = ["cost", *range(len(user.constraints), len(whole.constraints))]
+
+    def _solved(self) -> Problem:
+        return self.whole.in_cost_units()
 
     @property
     def times(self) -> Tensor:
@@ -209,11 +262,6 @@ class KeptInTime(KeptLifted):
     def multipliers(self) -> tuple[Tensor, ...]:
         """Copies of those of the user's rows, (B, K, p)."""
         return tuple(self.unit.view(-1, 1, 1) * lam for lam in self.lam[: len(self.user.constraints)])
-
-    def copies(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """See `Kept`: those of the user's states and controls."""
-        (X, U, K, status, iterations), n, m = super().copies(), self.user.n, self.user.m
-        return X[..., :n].contiguous(), U[..., :m].contiguous(), K[..., :m, :n].contiguous(), status, iterations
 
     def shift(self, by: float) -> None:
         """Let all trajectories and multipliers begin `by` seconds later; see `Elapsed`."""
@@ -228,6 +276,10 @@ class KeptInTime(KeptLifted):
         for z, new in zip((self.X, self.U, *self.lam), (*states_in_time(user, X, U, span.factors), *lam), strict=False):
             z.copy_(new)
 
+    def begin_at(self, rows: Tensor, X: Tensor, U: Tensor) -> None:
+        """See `Kept`: trajectories of this form."""
+        Kept.begin_at(self, rows, X, U)
+
     def take_over(self, rows: Tensor, solution: Solution) -> None:
         """See `Kept`."""
         user = self.user.take(rows)
@@ -238,33 +290,27 @@ class KeptInTime(KeptLifted):
         for lam, solved in zip(self.lam, solution.multipliers.scaled(1.0 / self.unit[rows]).lam, strict=False):
             lam[rows] = solved
 
-    def read(self, changed: set[str | int], now: Problem) -> set[str | int]:
-        """See `KeptLifted`."""
-        places = sorted(self._copied_parts.intersection(changed))
-        if not places and "time" not in changed:
-            return changed
-        new, n = in_time(now), self.user.n
-        self._x0[:, n + 1 :] = new.x0[:, n + 1 :].numpy()  # controls before
-        if "time" in changed:
-            overwrite(self.whole.cost, new.cost)
-            places += range(len(self.user.constraints), len(new.constraints))
-            changed = changed.union({"cost"}, places)
-        for i in places:
-            overwrite(self.whole.constraints[i], new.constraints[i])
-        return changed
+
+def _part(problem: Problem, place: str | int) -> Any:
+    """The cost of a problem, or a constraint by its place."""
+    return problem.cost if place == "cost" else problem.constraints[int(place)]
 
 
-def kept_in_time(problem: Problem, options: BarrierOptions) -> KeptInTime | None:
-    """Problems with a free time, packed; None where C can't serve them.
+def kept_of(problem: Problem, options: BarrierOptions) -> Kept | None:
+    """Problems packed in the form `for_solvers`; None where C can't serve them, or has no warm starts: of horizons.
 
     Args:
         options: see `Kept`.
     """
-    whole = current(in_time(problem))
-    kernels = interior_of(whole)
+    whole = current(for_solvers(problem))
+    kernels = None if problem.horizon is not None else interior_of(whole)
     if not isinstance(kernels, InteriorEngine) or kernels.engine.captured.reads_own:
         return None
-    return KeptInTime(kernels, problem, whole, options)
+    if problem.time is not None:
+        return KeptInTime(kernels, problem, whole, options)
+    if any(part.joins_knots for part in problem.constraints):
+        return KeptCarried(kernels, problem, whole, options)
+    return Kept(kernels, whole, cost_scale(whole), options)
 
 
 def _numbers_in_time(by_problem: list[Number], problem: Problem, where: str) -> list[Number]:

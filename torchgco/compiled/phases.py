@@ -99,8 +99,7 @@ class KeptPhases(KeptLifted):
         if not changed - {START}:
             return set()
         kept, new, parts = self.problem, Whole(now).problem, set[str | int]()
-        first = self._given.shape[1] + self._frees
-        self._x0[:, first:] = new.x0[:, first:].numpy()
+        self._x0[:, self._first :] = new.x0[:, self._first :].numpy()
         pairs: Iterable[tuple[str | int, Any, Any]] = [
             ("dynamics", kept.dynamics, new.dynamics), ("cost", kept.cost, new.cost),
             *((i, *pair) for i, pair in enumerate(zip(kept.constraints, new.constraints, strict=True))),

@@ -51,6 +51,11 @@ def follows(part: Any) -> bool:
     return part.joins_knots and getattr(part, "previous", None) is not None
 
 
+def previous_of(problem: Problem) -> list[str]:
+    """The names of numbers that are the controls before."""
+    return [f"constraints[{i}].previous" for i, part in enumerate(problem.constraints) if follows(part)]
+
+
 def in_periods(problem: Problem, share: float) -> Problem:
     """The problem in a loop whose periods are a share of a stage.
 

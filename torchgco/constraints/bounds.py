@@ -13,7 +13,7 @@ from torch import Tensor, inf
 from torch.nn.functional import pad
 
 from torchgco.base.errors import InputError
-from torchgco.base.numbers import Floats, Number, Wrong, crossed, numbers, numbers_of_fields
+from torchgco.base.numbers import Floats, Number, Wrong, crossed, finite, numbers
 from torchgco.base.shapes import Dimensions, bound_of, check_finite, check_shape, tensor
 from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, FirstRowsInTime, Lowered, count_of, resolve_knots
@@ -359,7 +359,8 @@ class RateBounds(_Bounds):
         return (U - torch.cat((first, U[:, :-1]), dim=1))[:, self.knots]
 
     def numbers(self, where: str, index: int) -> list[Number]:
-        return numbers_of_fields(self, where, index)
+        before = [] if self.previous is None else numbers(where, {"previous": (self.previous, finite)}, index)
+        return super().numbers(where, index) + before
 
     def accumulate(self, X: Tensor, U: Tensor, g: Tensor, h: Tensor, H: Tensor) -> None:
         if self.states is None:

@@ -8,11 +8,13 @@ from typing import Any
 import torch
 
 from torchgco.compiled import Compiled
+from torchgco.compiled.stages import previous_of
 from torchgco.export.beginning import Beginning
 from torchgco.export.numbers import Changing
 from torchgco.export.source import Solver
 from torchgco.native.interior import Kept
 from torchgco.problem.problem import Problem
+from torchgco.receding.plan import stages_between
 
 NEAR = 1e-3  # of the range of controls along the test's plans, that those in single precision may differ from Python's
 
@@ -21,6 +23,9 @@ FIXED_NOTE = "- `stages` is by how many stages of {} s time has gone on since th
 FREE_NOTE = """\
 - The third argument is the time since the last step, s. `w.t` has the times of the plan's knots, s, and u is the plan's
   mean over `w.period`, s: set it to yours. The first step begins with a plan that was found when this was written."""
+RATES_NOTE = """\
+- Rates count from `w.numbers.previous`, in which each step leaves the controls that it returned: where the vehicle did
+  something else, write that there. A step of no time, for the same states, counts from where the one before did."""
 ELEMENTS_NOTE = """\
 - There are {} elements: `NAME_init(&w, 0)` to `NAME_init(&w, {})` load the numbers of one of them."""
 
@@ -37,6 +42,7 @@ class Exported:
     name: str
     receding: bool
     number: int  # bytes of a number: 8 or 4
+    seconds: float | None = None  # from one step to the next; None: a stage
 
     @property
     def problem(self) -> Problem:
@@ -55,14 +61,20 @@ class Exported:
         return f"{p.n} states, {p.m} controls, {p.N} stages{free}{many}"
 
     @property
-    def stage(self) -> str:
+    def dt(self) -> float:
         """The length of a stage, s."""
-        return f"{float(torch.as_tensor(self.problem.dynamics.dt).flatten()[0]):g}"
+        return float(torch.as_tensor(self.problem.dynamics.dt, dtype=torch.float64).flatten()[0])
+
+    @property
+    def stage(self) -> str:
+        """The same as text."""
+        return f"{self.dt:g}"
 
     @property
     def period(self) -> float:
         """By how much the horizon moves from step to step: stages, or seconds where the time is free."""
-        return float(self.receding) * (float(self.stage) if self.is_free else 1.0)
+        seconds = self.receding * (self.dt if self.seconds is None else self.seconds)
+        return float(seconds if self.is_free else stages_between(seconds / self.dt))
 
     @property
     def words(self) -> dict[str, Any]:
@@ -74,9 +86,18 @@ class Exported:
         return {
             "SAME": same, "REAL": real, "FIRST": ", 0" if many else "",
             "MOVED": "workspace.t[1]" if free else "NAME_STAGES", "USUAL": "NAME_PERIOD" if free else "NAME_STAGES",
-            "NOTES": "\n".join([FREE_NOTE if free else FIXED_NOTE.format(self.stage)] + [elements] * many),
+            "NOTES": "\n".join(
+                [FREE_NOTE if free else FIXED_NOTE.format(self.stage)]
+                + [RATES_NOTE] * bool(self.previous)
+                + [elements] * many
+            ),
             "GUESSED": ", t" * free,
         }  # fmt: skip
+
+    @property
+    def previous(self) -> list[str]:
+        """The names of numbers in which each step leaves its controls."""
+        return previous_of(self.problem) if self.receding else []
 
     @property
     def sizes(self) -> tuple[int, int, int]:

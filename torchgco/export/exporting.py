@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from torchgco.base.errors import InputError, shown
-from torchgco.base.options import check_value
+from torchgco.base.options import Seconds, check_value
 from torchgco.compiled import Compiled, compile
 from torchgco.compiled.motion import Motion
+from torchgco.compiled.stages import check_loop_in_free_time, in_periods, previous_of, stage_of
 from torchgco.constraints.gates import has_gates
+from torchgco.constraints.link import Integral
 from torchgco.export.beginning import beginning
 from torchgco.export.exported import Exported
 from torchgco.export.files import Build, write_files
@@ -38,6 +42,7 @@ def export_c(
     changes: Sequence[str] | None = None,
     build: Build = "cmake",
     dtype: torch.dtype = torch.float64,
+    period: float | None = None,
 ) -> Path:
     """Write a problem's interior point as C99 that stands alone: no heap, no global state, no library but libm.
 
@@ -56,36 +61,31 @@ def export_c(
         problem: B problems, or a compiled problem. Numbers of a GPU are copied.
         folder: is made if it isn't there; files of these names are overwritten.
         name: of files, types and functions: a word of C.
-        receding: each step's horizon begins a stage, in a free time dt s, after that of the step before.
-        changes: names of the numbers that steps may change, beside the places of obstacles that move where `receding`;
-            the others are constants. None: all that C reads as they are or copies of.
+        receding: each step's horizon begins a `period` after that of the step before.
+        changes: names of the numbers that steps may change, beside the places of obstacles that move and the controls
+            that rates count from where `receding`; the others are constants. None: all that C reads as they are or
+            copies of.
         build: what builds the folder: "cmake"; "arduino", a library for Arduino and PlatformIO with sketches; or
             "zephyr", a module with a sample. Of the last two NAME.h and NAME.c lie in `src`.
         dtype: of all numbers in C. torch.float32 is for processors without a unit for doubles: half of the memory, and
             controls to 1e-3 of their range or, mostly, 1e-4.
+        period: s, from one step to the next, as of `MPC`; None: a stage of dt.
 
     Returns:
         the folder.
 
     Raises:
-        InputError: a name that is no word of C, or a problem that C can't serve: no element, horizons, `RateBounds`,
-            `Link` or `Integral`, a problem in single precision, code that can't be compiled, where `receding` gates,
-            and obstacles that move without numbers that say where they are; a number that can't change; another dtype.
-            No file is written then.
+        InputError: a name that is no word of C, or a problem that C can't serve: no element, horizons, `Integral`, a
+            problem in single precision, code that can't be compiled, where `receding` gates, obstacles that move
+            without numbers that say where they are and, in a free time, rates that count from controls before; a number
+            that can't change; another dtype. No file is written then.
     """
-    check_value(receding, bool, "receding")
-    check_value(build, Build, "build")
-    if dtype not in BYTES:
-        raise InputError("dtype", "torch.float64 or torch.float32", shown(dtype))
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
-        raise InputError("name", "a word of C, such as controller", shown(name))
+    _check_options(name, build, dtype, receding, period)
     if isinstance(problem, Compiled):
         changes = problem.changes if changes is None else changes
-        compiled = _compiled_again(problem)
-    else:
-        compiled = compile(_checked(problem), "interior_point")
+    compiled = _compiled(problem, period)
     kept = _served(compiled, receding)
-    places = Motion(compiled.problem).places if receding else []
+    places = [*Motion(compiled.problem).places, *previous_of(compiled.problem)] if receding else []
     if changes is not None:
         changes = list(dict.fromkeys(compiled.numbers.find(name).name for name in [*changes, *places]))
     some = changing(kept, compiled, changes)
@@ -93,18 +93,34 @@ def export_c(
         raise InputError("problem", "obstacles whose places C reads as they are, where they move", lacking[0])
     with torch.no_grad():
         begin = beginning(compiled.now, kept.problem.m)
-    solver = solver_source(kept, some, compiled.interior, begin, BYTES[dtype])
-    exported = Exported(compiled, kept, solver, some, begin, name, receding, BYTES[dtype])
+    solver = solver_source(kept, some, compiled.interior, begin, BYTES[dtype], receding)
+    exported = Exported(compiled, kept, solver, some, begin, name, receding, BYTES[dtype], period)
     return write_files(exported, Path(folder), build)
 
 
-def _compiled_again(problem: Compiled) -> Compiled:
-    """The problem as it is now, for the interior point."""
-    with served_by(*problem.origin):
-        return compile(problem.now, "interior_point", tolerance=problem.interior.tolerance)
+def _check_options(name: Any, build: Any, dtype: Any, receding: Any, period: Any) -> None:
+    """Raise InputError unless these are words and values that `export_c` takes."""
+    check_value(receding, bool, "receding")
+    check_value(build, Build, "build")
+    if dtype not in BYTES:
+        raise InputError("dtype", "torch.float64 or torch.float32", shown(dtype))
+    if check_value(period, Seconds | None, "period") is not None and not receding:
+        raise InputError("period", "None where the horizon doesn't recede", shown(period))
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w*", name) or name in re.findall(r"\w+", C_WORDS):
+        raise InputError("name", "a word of C, such as controller", shown(name))
 
 
-def _checked(problem: Problem) -> Problem:
+def _compiled(problem: Problem | Compiled, period: float | None) -> Compiled:
+    """The problem as it is now, for the interior point and steps of this period."""
+    again = isinstance(problem, Compiled)
+    asked = _checked(problem.now if again else problem)
+    if period is not None and asked.time is None and (share := period / stage_of(asked)) < 1.0:
+        asked = in_periods(asked, share)
+    with served_by(*problem.origin) if again else nullcontext():
+        return compile(asked, "interior_point", tolerance=problem.interior.tolerance if again else None)
+
+
+def _checked(problem: Any) -> Problem:
     if not isinstance(problem, Problem):
         raise InputError("problem", "a Problem, or what torchgco.compile makes of one", type(problem).__name__)
     if problem.B == 0:
@@ -114,10 +130,8 @@ def _checked(problem: Problem) -> Problem:
     if problem.horizon is not None:
         raise InputError("problem.horizon", "None in exported C", type(problem.horizon).__name__)
     for i, part in enumerate(problem.constraints):
-        if part.joins_knots:
-            raise InputError(
-                f"constraints[{i}]", "one without RateBounds, Link and Integral in exported C", type(part).__name__
-            )
+        if isinstance(part, Integral):
+            raise InputError(f"constraints[{i}]", "one without Integral in exported C", "Integral")
     return problem
 
 
@@ -126,6 +140,8 @@ def _served(compiled: Compiled, receding: bool) -> Kept:
     problem = _checked(compiled.problem)
     if receding and has_gates(problem):
         raise InputError("problem", "one without Gates unless receding=False: a loop would put them off", "Gates")
+    if receding and problem.time is not None:
+        check_loop_in_free_time(problem, 0.0)
     kept = compiled._kept
     if kept is None:
         kernels = interior_of(current(for_solvers(problem)))  # raises, or warns, what is missing

@@ -59,6 +59,7 @@ SEVERAL = {
     "OF_ELEMENT": ", int element",
     "THAT": "\n   element: from 0 to NAME_ELEMENTS - 1; with another one all steps return NAME_BAD_NUMBER.",
 }  # fmt: skip
+LEFT = ", in which each step leaves its u"
 HEAD = """/* NAME.c: written by torchgco {version}. NAME.h says what it offers, README.md how it is compiled. */
 #include "NAME.h"
 #include <math.h>
@@ -93,8 +94,8 @@ def write_files(exported: Exported, folder: Path, build: Build) -> Path:
         "FILES": (HERE / f"{build}.md").read_text().rstrip(),  # before the others: it has marks of its own
         "TITLE": exported.title, "DT": exported.stage, "VERSION": VERSION,
         "SYMBOL": f"TORCHGCO_{exported.name.upper()}", "X0": _numbers(exported.problem.x0[0]),
-        "EXAMPLE": EXAMPLE, "PERIODS": len(periods), "MILLISECONDS": max(1, round(1e3 * float(exported.stage))),
-        "STACK": STACK + SPARE,
+        "EXAMPLE": EXAMPLE, "PERIODS": len(periods), "STACK": STACK + SPARE,
+        "MILLISECONDS": max(1, round(1e3 * (exported.seconds or exported.dt))),
         **exported.words,
     }  # fmt: skip
     files = {f"{source}NAME.h": _header(exported), f"{source}NAME.c": _code(exported)}
@@ -125,10 +126,11 @@ def _header(exported: Exported) -> str:
         for status in Status
     ]
     members = [
-        f"    double {m.name}[{m.size}]; /* {' x '.join(map(str, m.shape))}: {m.full} */"
+        f"    double {m.name}[{m.size}]; /* {' x '.join(map(str, m.shape))}: {m.full}{left} */"
         for m in exported.changing.members
+        for left in [LEFT if m.full in exported.previous else ""]
     ]
-    lam = sum(exported.solver.multipliers.values())
+    lam, before = sum(exported.solver.multipliers.values()), f"\n    double before[{p.m}];" if exported.previous else ""
     kind = FREE if exported.is_free else FIXED
     shapes = {"SIZE_X": X, "SIZE_U": U, "SIZE_K": K, "SIZE_x": x, "SIZE_u": u, "ROOM": exported.solver.room}
     words: dict[str, Any] = {
@@ -137,7 +139,7 @@ def _header(exported: Exported) -> str:
         "PERIOD": f"{exported.period!r}",
         "STATUSES": "\n".join(statuses), "NUMBERS": "\n".join(members) or "    double none; /* no number may change */",
         "MAX_ITERATIONS": exported.compiled.interior.max_iterations,
-        "MULTIPLIERS": f"    double lam[{lam}];" if lam else "",
+        "MULTIPLIERS": f"    double lam[{lam}];" if lam else "", "BEFORE": before,
     }  # fmt: skip
     return _filled("controller.h", exported, **words)
 
@@ -188,7 +190,7 @@ def _unit(member: Member, exported: Exported) -> str:
     """The units of a member's entries, where the problem's parts say."""
     last, dynamics = member.full.rpartition(".")[2], exported.problem.dynamics
     states, controls = ([component.unit for component in of(dynamics)] for of in (states_of, controls_of))
-    if last in ("x_ref", "u_ref"):
+    if last in ("x_ref", "u_ref", "previous"):
         return ", ".join(states if last == "x_ref" else controls)
     if last in ("centers", "radii", "vehicle_radius", "places", "half_sizes"):
         return "m"

@@ -26,9 +26,9 @@ BAD_STATE, BAD_NUMBER = -1, -2
 WITHOUT_ERRNO = "-fno-math-errno"
 # gcc 12.2 -O2 with AVX-512 places arrays of floats in the red zone, below a function's frame, without their alignment.
 WITHOUT_RED_ZONE = ("-mno-red-zone",)
-_MEMBER = re.compile(r"^    (double|float|int) ([^;]+);(?: /\* ([\d x]+): (\S+) \*/)?", re.MULTILINE)
+_MEMBER = re.compile(r"^    (double|float|int) ([^;]+);(?: /\* ([\d x]+): ([^\s,]+)[^*]* \*/)?", re.MULTILINE)
 _ONE, _CLOCK = re.compile(r"(\w+)(?:\[(\d+)\])?"), "double (*clock)(void);"
-_SIZE = re.compile(r"^#define \w+_(NX|NU|N|STAGES|PERIOD|ELEMENTS) ([\d.e-]+)(?:.* ([\d.e-]+) s \*/)?", re.MULTILINE)
+_SIZE = re.compile(r"^#define \w+_(NX|NU|N|STAGES|PERIOD|ELEMENTS) (\S+)(?:.* ([\d.e-]+) s \*/)?", re.MULTILINE)
 _CALLBACK = ctypes.CFUNCTYPE(ctypes.c_double)
 _KINDS = {"double": ctypes.c_double, "float": ctypes.c_float, "int": ctypes.c_int}
 
@@ -74,7 +74,7 @@ class LoadedController:
     """
 
     def __init__(self, header: str, code: str, name: str, period: float | None, element: int) -> None:
-        sizes = {size: (float(value), unit) for size, value, unit in _SIZE.findall(header)}
+        sizes = {size: (_value(text), unit) for size, text, unit in _SIZE.findall(header)}
         self.n, self.m, self.N = (int(sizes[size][0]) for size in ("NX", "NU", "N"))
         self.dt, self._is_free = float(sizes["N"][1]), "PERIOD" in sizes
         usual = sizes["PERIOD"][0] if self._is_free else sizes["STAGES"][0] * self.dt
@@ -143,7 +143,7 @@ class LoadedController:
         return torch.from_numpy(np.array(self._workspace.t)).double()
 
     def reset(self) -> None:
-        """Forget the plan; numbers stay."""
+        """Forget the plan; numbers stay, but for those that steps write."""
         self._functions["reset"](ctypes.byref(self._workspace))
         self.t, self._begun = 0.0, False
 
@@ -213,6 +213,11 @@ class LoadedController:
         if floats.shape not in (there.shape, (1, *there.shape)):
             raise InputError(name, f"shape {there.shape}", floats.shape)
         return floats
+
+
+def _value(text: str) -> float:
+    """A constant of C; those in single precision are hexadecimal."""
+    return float.fromhex(text.rstrip("f")) if text.startswith("0x") else float(text)
 
 
 def _layout(header: str) -> tuple[dict[str, tuple[int, ...]], Any]:

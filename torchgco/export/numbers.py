@@ -16,7 +16,7 @@ from torchgco.base import numbers as checks
 from torchgco.base.errors import InputError
 from torchgco.base.numbers import Number
 from torchgco.compiled import Compiled
-from torchgco.compiled.numbers import KeptInTime, steady
+from torchgco.compiled.numbers import KeptCarried, steady
 from torchgco.native.interior import Kept
 from torchgco.native.structures import Array
 
@@ -121,7 +121,9 @@ def changing(kept: Kept, compiled: Compiled, asked: Sequence[str] | None) -> Cha
 
 
 def _read(kept: Kept, part: str | int | None = None) -> Iterator[Tensor]:
-    """The tensors of the arrays that C reads, of one part or of all."""
+    """The tensors of the arrays that C reads, of one part or of all, and what is carried at the start."""
+    if isinstance(kept, KeptCarried):
+        yield kept.carried
     groups: dict[str | int, list[Array]] = {"cost": list(kept._cost), "dynamics": [kept._model]}
     for i, own in enumerate(kept._numbers):
         groups[i] = [value for value in own.values() if isinstance(value, Array)]
@@ -150,18 +152,18 @@ def _ways(
 def _probed(kept: Kept, compiled: Compiled, number: Number, first: int) -> dict[int, Copies] | None:
     """The entries that change with a number, where all of them become one of its entries, the same ones of every
     element; None where they don't."""
-    view, draws, part = number.views[0], np.random.default_rng(0), number.part
-    old, probe = view.copy(), draws.uniform(1.0, 2.0, view.shape)
+    old, draws, part = number.value, np.random.default_rng(0), number.part
+    probe = draws.uniform(1.0, 2.0, old.shape)
     if part == "time":  # of which bounds don't cross
         probe = old / probe if number.name.endswith(".least") else old * probe
-    part = None if isinstance(kept, KeptInTime) else part  # lifted parts depend on several
+    part = None if isinstance(kept, KeptCarried) else part  # lifted parts depend on several
     before = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, part)}
     try:
         _write(kept, compiled, number, probe)
         after = {tensor.data_ptr(): tensor.clone() for tensor in _read(kept, part)}
     finally:
         _write(kept, compiled, number, old)
-    found, B = dict[int, Copies](), len(view)
+    found, B = dict[int, Copies](), len(old)
     places = [{value: i for i, value in enumerate(row)} for row in probe.reshape(B, -1).tolist()]
     for address, tensor in after.items():
         changed = tensor != before[address]
@@ -179,11 +181,9 @@ def _probed(kept: Kept, compiled: Compiled, number: Number, first: int) -> dict[
 
 
 def _write(kept: Kept, compiled: Compiled, number: Number, values: np.ndarray) -> None:
-    number.views[0][...] = values
-    if number.after is not None:
-        number.after()
+    number.write(values)
     parts = {number.part}
-    if isinstance(kept, KeptInTime):
+    if isinstance(kept, KeptCarried):
         parts = kept.read(parts, compiled.now)
     for part in parts:
         if part == "dynamics":

@@ -46,7 +46,7 @@ def periods_of(exported: Exported) -> Periods:
     """Those of each element in Python, as long as they converge."""
     free, begin, B = exported.is_free, exported.begin, exported.problem.B
     compiled = compile(
-        exported.compiled.now, "interior_point", ["x0"], exported.receding and not free,
+        exported.compiled.now, "interior_point", ["x0", *exported.previous], exported.receding and not free,
         exported.compiled.interior.tolerance,
     )  # fmt: skip
     elapsed = exported.period
@@ -63,13 +63,14 @@ def periods_of(exported: Exported) -> Periods:
         if not runs.any():
             break
         u = _controls(compiled, exported, answer)
+        compiled.numbers.write(dict.fromkeys(exported.previous, u))
         plans.append(answer.U[torch.from_numpy(runs)].flatten(0, 1).numpy())
         for b in runs.nonzero()[0].tolist():
             each[b].states.append(x[b])
             each[b].controls.append(u[b].numpy())
             each[b].iterations.append(int(answer.iterations[b]))
             each[b].elements.append(b)
-        later = first if not exported.receding else _states_at(answer, elapsed) if free else answer.X[:, 1].numpy()
+        later = _states_at(answer, elapsed) if exported.receding else first
         x = later + DISTURBED * answer.X.abs().amax(1).numpy() * draws.standard_normal(x.shape)
     U = np.concatenate(plans) if plans else np.zeros((1, exported.problem.m))
     every = Periods(elapsed, (np.ptp(U, axis=0), np.abs(U).max(axis=0)))
@@ -82,7 +83,7 @@ def periods_of(exported: Exported) -> Periods:
 def _stepped(compiled: Compiled, exported: Exported, x: np.ndarray, elapsed: float, is_first: bool) -> Answer:
     """A call from the states x (B, n); where the time is free, the first one begins with the plan that C has."""
     if not exported.is_free:
-        return compiled.call({"x0": x})  # type: ignore[no-any-return]
+        return compiled.call({"x0": x}, shift=exported.period)  # type: ignore[no-any-return]
     plan, user = exported.begin.plan, compiled.problem
     if not is_first or plan is None:
         return compiled.call({"x0": x}, elapsed=elapsed)  # type: ignore[no-any-return]
@@ -111,11 +112,12 @@ def _controls(compiled: Compiled, exported: Exported, answer: Answer) -> Tensor:
     return u
 
 
-def _states_at(answer: Answer, seconds: float) -> np.ndarray:
-    """The states (B, n) of an answer so many seconds after its start, on straight lines."""
-    assert answer.t is not None
-    each = zip(answer.t.numpy(), answer.X.numpy(), strict=True)
-    return np.array([[np.interp(seconds, t, values) for values in X.T] for t, X in each])
+def _states_at(answer: Answer, later: float) -> np.ndarray:
+    """The states (B, n) of an answer so many seconds, or stages, after its start, on straight lines."""
+    B, knots, _ = answer.X.shape
+    times = np.tile(np.arange(knots), (B, 1)) if answer.t is None else answer.t.numpy()
+    each = zip(times, answer.X.numpy(), strict=True)
+    return np.array([[np.interp(later, t, values) for values in X.T] for t, X in each])
 
 
 def compared(exported: Exported, periods: Periods) -> dict[str, str]:

@@ -5,23 +5,26 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchgco.compiled.numbers import KeptCarried
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.constraints.bounds import LOOSE
 from torchgco.export.beginning import Beginning
+from torchgco.export.carried import Carried, carried_source
 from torchgco.export.numbers import ABOVE_ZERO, AT_LEAST_ZERO, BOUND, Changing, Copies, fixed_radii
 from torchgco.export.single import VIOLATION, options_in_single
 from torchgco.export.tables import table
+from torchgco.export.writer import Writer
 from torchgco.lagrangian.barrier import FILTERED
 from torchgco.native import structures as c
 from torchgco.native.codegen.emit import literal
-from torchgco.native.declarations import Structure, defines, kept_by
+from torchgco.native.declarations import defines, kept_by
 from torchgco.native.includes import C
 from torchgco.native.interior import Kept
 from torchgco.native.packing import kind_of
@@ -32,10 +35,6 @@ from torchgco.solvers.interior import FEW, ROUGH, SADDLE_STEPS, InteriorPoint
 from torchgco.solvers.timing import HELD_FIRST
 
 HERE = Path(__file__).parent / "c"
-TYPES = {
-    torch.float64: "double", torch.float32: "float", torch.int64: "int64_t", torch.int32: "int32_t",
-    torch.bool: "uint8_t",
-}  # fmt: skip
 # Files of the kernels, and what takes their places.
 REPLACED = {
     "vectors.h": C / "scalar" / "vectors.h", "wide.h": C / "scalar" / "wide.h",
@@ -45,68 +44,7 @@ FILES = "riccati.c", "interior.c", "sweep.h", "rollout.h"  # the interior point,
 POINTERS_OF_ROWS = 11  # of the structure Rows, of a single lane
 ON_STACK = 128  # numbers of one stage that a step has on the stack, at most: 1 kB
 HELD = 112  # doubles of the structures Barrier and Track, at most, beside the filter
-OF_ELEMENTS = "constant", "least_cost", "free_start", "map_of"  # pointers to numbers of every element
 SCALARS = 16  # numbers of the structure Solve beside its arrays, and what structures are padded with
-
-
-@dataclass
-class Writer:
-    """Structures as initialisers of C; what they point to is a table, or has a place in the workspace.
-
-    Attributes:
-        places: expressions by address.
-        elements: how many problems tables have numbers of, one after the other; `element` is the one in C.
-        tables: definitions of constant arrays.
-    """
-
-    tensors: dict[int, Tensor]
-    places: dict[int, str]
-    elements: int = 1
-    tables: list[str] = field(default_factory=list)
-    flash: int = 0  # bytes of tables
-    number: int = 8  # of a number
-
-    def table(self, tensor: Tensor) -> str:
-        """The name of a constant array with these numbers."""
-        name = f"table_{len(self.tables)}"
-        self.flash += tensor.numel() * min(tensor.element_size(), self.number)
-        self.tables.append(table(f"static const {TYPES[tensor.dtype]} {name}[]", tensor))
-        return name
-
-    def body(self, structure: Structure, **given: str) -> str:
-        """An initialiser; `given` are expressions of fields."""
-        rows = []
-        for name, declared in structure.declared.items():
-            value = getattr(structure, name)
-            if name in given:
-                rows.append(f".{name} = {given[name]}")
-            elif isinstance(value, c.Array):
-                rows += [f".{name} = {self._array(value)}"] if value.data else []
-            elif isinstance(value, Structure):
-                inner = self.body(value)
-                rows += [] if inner == "{0}" else [f".{name} = {inner}"]
-            elif isinstance(value, ctypes.Array):
-                rows.append(f".{name} = {{{', '.join(self.body(one) for one in value)}}}")
-            elif declared.pointer:
-                rows += [f".{name} = {self._pointer(value, name in OF_ELEMENTS)}"] if value else []
-            elif value != 0:
-                rows.append(f".{name} = {literal(value) if isinstance(value, float) else value}")
-        return f"{{{', '.join(rows) or '0'}}}"
-
-    def _array(self, array: c.Array) -> str:
-        """That of the element."""
-        place = self._pointer(array.data, array.element != 0)
-        fields = {"data": place, "knot": array.knot, "size": array.size}
-        return f"{{{', '.join(f'.{name} = {value}' for name, value in fields.items() if value)}}}"
-
-    def _pointer(self, address: int, by_element: bool) -> str:
-        """Where it begins, of arrays with numbers of every element at those of one."""
-        if address not in self.places:
-            tensor = self.tensors[address]
-            self.places[address] = self.table(tensor)
-            if by_element and self.elements > 1:
-                self.places[address] += f" + element * {tensor.numel() // self.elements}"
-        return self.places[address]
 
 
 @dataclass(frozen=True)
@@ -128,37 +66,48 @@ class Solver:
     flash: int
 
 
-def solver_source(kept: Kept, changing: Changing, interior: InteriorPoint, begin: Beginning, number: int) -> Solver:
+def solver_source(
+    kept: Kept, changing: Changing, interior: InteriorPoint, begin: Beginning, number: int, receding: bool
+) -> Solver:
     """The C of a packed problem.
 
     Args:
         begin: with what solves begin that have no plan before.
+        receding: whether steps are those of a loop, in which rates count from the controls of the step before.
         number: bytes of a number, 8 or 4. The text is of doubles in any case: see `single`.
     """
     problem, how = kept.problem, kept.how
     B, multipliers = problem.B, {i: lam[0].numel() for i, lam in enumerate(kept.lam) if lam.numel() > 0}
-    writer = Writer(kept_by(how), _places(kept, changing, multipliers), B, number=number)
-    made = [_made(kept, j, address, copies, number) for j, (address, copies) in enumerate(changing.copied.items())]
+    writer = Writer(_tensors(kept), _places(kept, changing, multipliers), B, number=number)
+    made = [
+        _made(kept, j, writer.tensors[address], copies, number)
+        for j, (address, copies) in enumerate(changing.copied.items())
+    ]
+    carried = carried_source(kept, changing, writer, receding)
     K = len(problem.constraints)
     rows = [writer.body(row) for row in _constraints(kept)]
     fields = writer.body(kept.packed, constraint="b->constraints", arena="&b->arena")
     options = writer.body(how, of="&b->problem", **({} if number == 8 else _other_options(interior)))
-    lines = _bound(rows, fields, options, changing, made, _rest(changing, writer, begin), begin)
+    lines = _bound(rows, fields, options, changing, made, _rest(changing, writer, begin), begin, carried)
     count = _count(kept)
-    made_numbers = sum(kept_by(how)[address].numel() // B for address in changing.copied)
+    made_numbers = sum(writer.tensors[address].numel() // B for address in changing.copied)
     numbers = count + 2 * FILTERED + _solve_numbers(problem, begin) + made_numbers
     room = structure_numbers(K) + -(-numbers * number // 8)
     texts = {name: own.read_text() for name, own in REPLACED.items()}
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
-    parts = {"CONTACT": "contact.c", "FREE_TIME": "free_time.c" if begin.segments else None}
+    parts = {
+        "CONTACT": "contact.c", "FREE_TIME": "free_time.c" if begin.segments else None,
+        "CARRIED": "carried.c" if carried.pointers else None,
+    }  # fmt: skip
     text = (HERE / "controller.c").read_text()
     for mark, file in parts.items():
         text = text.replace(f"@{mark}@\n", "" if file is None else (HERE / file).read_text())
     own = [
-        _constants(interior, bool(K), number), _sizes(B, begin, count, multipliers), *writer.tables,
-        *(part.tables for part in made), *begin.tables(), _numbers_table(changing, B), _depths(kept),
-        _structure(K, [part.declared for part in made], begin),
+        _constants(interior, bool(K), number), _sizes(B, begin, count, multipliers), defines(carried.sizes),
+        *writer.tables,
+        *(part.tables for part in made), *begin.tables(), *carried.tables, _numbers_table(changing, B), _depths(kept),
+        _structure(K, [part.declared for part in made], begin, carried),
         _assertion(count, K), lines, _checks(changing), text,
     ]  # fmt: skip
     flash = writer.flash + number * sum(m.size * B for m in changing.members) + sum(part.flash for part in made)
@@ -179,6 +128,12 @@ def _kinds(kept: Kept) -> set[c.Kind]:
     parts: Sequence[Any] = kept.problem.constraints
     balls = (part.balls[0] for part in parts if kind_of(part) is c.Kind.BODY)
     return {kind_of(part) for part in (*parts, *balls)}
+
+
+def _tensors(kept: Kept) -> dict[int, Tensor]:
+    """What C reads and writes, by address."""
+    carried = [kept.carried] if isinstance(kept, KeptCarried) else []
+    return {**kept_by(kept.how), **{tensor.data_ptr(): tensor for tensor in carried}}
 
 
 def _count(kept: Kept) -> int:
@@ -231,8 +186,7 @@ class Made:
     flash: int
 
 
-def _made(kept: Kept, j: int, address: int, copies: Copies, number: int) -> Made:
-    (base,) = (tensor for place, tensor in kept_by(kept.how).items() if place == address)
+def _made(kept: Kept, j: int, base: Tensor, copies: Copies, number: int) -> Made:
     B = kept.problem.B
     size = base.numel() // B
     tables = [table(f"static const double base_{j}[]", base)]
@@ -240,7 +194,7 @@ def _made(kept: Kept, j: int, address: int, copies: Copies, number: int) -> Made
     tables += [table(f"static const int32_t {name}_{j}[]", map(int, values)) for name, values in places.items()]
     lines = [f"    memcpy(b->made_{j}, base_{j} + element * {size}, sizeof b->made_{j});"]
     if copies.squares:
-        tables += [table(f"static const double fixed_{j}[]", fixed_radii(kept, address))]
+        tables += [table(f"static const double fixed_{j}[]", fixed_radii(kept, base.data_ptr()))]
         at = f"fixed_{j}[element * {size + 1} + "
         fixed = f"{at}i], {at}{size}]"
         lines.append(f"    for (int i = 0; i < {size}; i++)")
@@ -263,8 +217,9 @@ def _rest(changing: Changing, writer: Writer, begin: Beginning) -> str:
 
 
 def _bound(
-    rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str, begin: Beginning
-) -> str:
+    rows: list[str], problem: str, how: str, changing: Changing, made: list[Made], rest: str, begin: Beginning,
+    carried: Carried,
+) -> str:  # fmt: skip
     """The function `bind`, which fills the structures that the solver reads."""
     lines = [
         UNKNOWN,
@@ -286,6 +241,7 @@ def _bound(
         "    b->contact_depth = contact_depth + element * " + str(max(1, len(rows))) + ";",
         "    b->most = MAX_SOLVE_ITERATIONS;",
         *(FREE_TIME if begin.segments else []),
+        *(f"    b->{name} = {place};" for name, place in carried.pointers.items()),
         "    b->arena_begin = (unsigned char *)(b + 1);",
         "    b->arena.next = b->arena_begin;",
         "    b->arena_end = (unsigned char *)w->room + sizeof w->room;",
@@ -387,7 +343,7 @@ def _depths(kept: Kept) -> str:
     return table("static const double contact_depth[]", every)
 
 
-def _structure(K: int, made: list[str], begin: Beginning) -> str:
+def _structure(K: int, made: list[str], begin: Beginning, carried: Carried) -> str:
     return "\n".join(
         [
             "/* What a step works with, at the beginning of a workspace's room. */",
@@ -400,6 +356,7 @@ def _structure(K: int, made: list[str], begin: Beginning) -> str:
             "    const double *rest; /* (N, NU) */",
             "    const double *contact_depth; /* of each constraint */",
             *(["    const double *first_factor; /* (SEGMENTS) */"] if begin.segments else []),
+            *(f"    const double *{name};" for name in carried.pointers),
             *(["    double factor[SEGMENTS]; /* with which a solve from rest begins */"] if begin.segments else []),
             *(["    double free_start[NX];"] if begin.segments else []),
             "    double mu, error, theta, falls, cost;",

@@ -99,9 +99,8 @@ class Multipliers:
 
 def later(knots: Sequence[int], steps: int) -> list[int]:
     """The places of the knots `steps` stages later: the last one beyond the end, a knot's own where there is none."""
-    index, end = {knot: i for i, knot in enumerate(knots)}, len(knots) - 1
-    last = max(knots, default=0)
-    return [index.get(knot + steps, end if knot + steps > last else i) for i, knot in enumerate(knots)]
+    index, last = {knot: i for i, knot in enumerate(knots)}, max(knots, default=0)
+    return [index.get(knot + steps, index[last] if knot + steps > last else i) for i, knot in enumerate(knots)]
 
 
 def shifted(values: Tensor, steps: float = 1, knots: Sequence[int] | None = None, last: Tensor | None = None) -> Tensor:

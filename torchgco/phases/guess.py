@@ -13,8 +13,8 @@ from torchgco.base.autodiff import jacobian
 from torchgco.base.errors import InputError, shown
 from torchgco.phases.lowered import Whole
 from torchgco.phases.phases import Jump, Phases
-from torchgco.problem.carried import carried_of
-from torchgco.problem.in_time import fitting_factors, states_in_time
+from torchgco.problem.horizons import states_for_solvers
+from torchgco.problem.in_time import fitting_factors
 from torchgco.problem.problem import Problem
 from torchgco.solvers.contracts import check_states
 from torchgco.solvers.straight import straight_line
@@ -53,7 +53,7 @@ def guess(whole: Whole, U0: Any, X0: Any, rest: Rest) -> tuple[Tensor, Tensor]:
         u = rest(member) if controls[i] is None else controls[i]
         x = _line(whole, i) if states[i] is None else states[i]
         factors = None if member.time is None else _factors(member, x, u, states[i] is not None)
-        x, u = of_solvers(member, x, u, factors)
+        x, u = states_for_solvers(member, x, u, factors)
         X.append(x)
         U.append(u)
     rows = []
@@ -66,14 +66,6 @@ def guess(whole: Whole, U0: Any, X0: Any, rest: Rest) -> tuple[Tensor, Tensor]:
             v = torch.cat((v, tau), dim=-1)
             rows.append(pad(v, (0, m - v.shape[-1])).unsqueeze(1))
     return torch.cat([pad(x, (0, n - x.shape[-1])) for x in X], dim=1), torch.cat(rows, dim=1)
-
-
-def of_solvers(member: Problem, X: Tensor, U: Tensor, factors: Tensor | None) -> tuple[Tensor, Tensor]:
-    """States and controls of a phase in the form that solvers work on."""
-    if factors is not None:
-        return states_in_time(member, X, U, factors)
-    carried = carried_of(member)
-    return (X if carried is None else torch.cat((X, carried.along(X, U, member.along)), dim=-1)), U
 
 
 def _line(whole: Whole, i: int) -> Tensor:

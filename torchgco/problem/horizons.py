@@ -24,7 +24,7 @@ from torchgco.costs.base import Cost, FunctionCost, WrappedCost, add_blocks
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.base import WrappedDynamics
 from torchgco.problem.carried import carried_of, with_carried
-from torchgco.problem.in_time import at_times, in_time
+from torchgco.problem.in_time import at_times, in_time, states_in_time
 from torchgco.problem.problem import Problem
 
 HORIZONS_FORM = "within horizons"  # what is kept with the form of the problem for this one
@@ -42,6 +42,18 @@ def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
     return within if joins_knots else with_carried(within)
 
 
+def states_for_solvers(problem: Problem, X: Tensor, U: Tensor, factors: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """States X (B, N+1, n) and controls U (B, N, m) of a problem as those of its form `for_solvers`.
+
+    Args:
+        factors: of the stages' length, (B, S), where the time is free; else None.
+    """
+    if factors is not None:
+        return states_in_time(problem, X, U, factors)
+    carried = carried_of(problem)
+    return (X if carried is None else torch.cat((X, carried.along(X, U, problem.along)), dim=-1)), U
+
+
 def as_solved(problem: Problem, X: Tensor, U: Tensor, times: Any = None) -> tuple[Problem, Tensor, Tensor]:
     """The problem `for_solvers` with states X (B, N+1, n) and controls U (B, N, m) of the user's problem in its form.
 
@@ -50,9 +62,7 @@ def as_solved(problem: Problem, X: Tensor, U: Tensor, times: Any = None) -> tupl
     """
     if problem.time is not None:
         return at_times(problem, X, U, times)
-    if (carried := carried_of(problem)) is not None:
-        X = torch.cat((X, carried.along(X, U, problem.along)), dim=-1)
-    return for_solvers(problem), X, U
+    return for_solvers(problem), *states_for_solvers(problem, X, U)
 
 
 def within_horizons(problem: Problem) -> Problem:

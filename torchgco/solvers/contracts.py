@@ -25,8 +25,7 @@ from torchgco.kernels import copied_to, cost_unit, current, interior_of, is_mixe
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
-from torchgco.problem.carried import carried_of
-from torchgco.problem.horizons import at_rest_after, for_solvers
+from torchgco.problem.horizons import at_rest_after, for_solvers, states_for_solvers
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.refusals import spared, warn_of_refusals
@@ -307,9 +306,7 @@ class Solver(Brief, Checked):
         if not self.take_states(call.problem):
             able = "interior_point or, without obstacles, gco; or ipopt"
             raise InputError("X0", f"None, or a solver that can begin with states: {able}", type(self).__name__)
-        if call.problem is not problem and (carried := carried_of(problem)) is not None:
-            X0 = torch.cat((X0, carried.along(X0, call.U0, problem.along)), dim=-1)
-        return replace(call, X0=X0)
+        return replace(call, X0=X0 if self.joins_knots else states_for_solvers(problem, X0, call.U0)[0])
 
     def frees_start(self, problem: Problem) -> bool:
         """Whether `run` chooses the free components of these problems' starts; if not, they stay at x0."""

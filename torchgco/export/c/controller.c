@@ -73,6 +73,7 @@ static void clamp(const Solve *b, int64_t k, int count, double *u) {
         }
 }
 
+@CARRIED@
 /* Whether one of the numbers is one that the problem can't have; 2: a bound is. */
 static int has_bad_number(const NAME_workspace *w, const Solve *b) {
     const double *numbers = (const double *)(const void *)&w->numbers;
@@ -91,6 +92,9 @@ static int has_bad_number(const NAME_workspace *w, const Solve *b) {
     for (int i = 0; i < (int)(sizeof steady / sizeof *steady); i++)
         for (int j = steady[i].width; j < N * steady[i].width; j++)
             if (numbers[steady[i].first + j] != numbers[steady[i].first + j - steady[i].width]) return 1;
+#endif
+#if CARRIED
+    if (rates_cross(b)) return 2;
 #endif
     for (int64_t i = 0; i < b->problem.constraints; i++) {
         const Constraint *con = b->problem.constraint + i;
@@ -153,9 +157,18 @@ static int judge(Solve *b, double *X, double *U, double *cost, double *violation
     return 1;
 }
 
-/* What is given of the first states X is that of x. */
+/* What is given of the first states X is that of x, and what is carried. */
 static void set_start(const Solve *b, double *X, const double *x) {
     for (int i = 0; i < USER_NX; i++) if (!b->how.free_start || b->how.free_start[i] == 0) X[i] = x[i];
+#if CARRIED
+    memcpy(X + NX - CARRIED, b->carried, CARRIED * sizeof *X);
+#endif
+}
+
+/* `count` rows of so many numbers, of which arrays have more or fewer. */
+static void copy_rows(double *to, int width, const double *from, int from_width, int count) {
+    for (int k = 0; k < count; k++)
+        for (int i = 0; i < width && i < from_width; i++) to[k * width + i] = from[k * from_width + i];
 }
 
 /* Rollout of U, or with feedback of U + K (x - X), into b->X, b->U, from the states x. */
@@ -223,12 +236,8 @@ static int is_over(const NAME_workspace *w, const Solve *b, double until) {
 
 /* What was found is the plan from now on. */
 static void fly(NAME_workspace *w, const Solve *b) {
-    for (int k = 0; k <= N; k++) memcpy(w->X + k * USER_NX, b->X + k * NX, USER_NX * sizeof *w->X);
-    for (int k = 0; k < N; k++) for (int j = 0; j < USER_NU; j++) {
-        int to = k * USER_NU + j;
-        w->U[to] = b->U[k * NU + j];
-        for (int i = 0; i < USER_NX; i++) w->K[to * USER_NX + i] = b->gains[(k * NU + j) * NZ + i];
-    }
+    copy_rows(w->X, USER_NX, b->X, NX, N + 1); copy_rows(w->U, USER_NU, b->U, NU, N);
+    for (int k = 0; k < N; k++) copy_rows(w->K + k * USER_NU * USER_NX, USER_NX, b->gains + k * NU * NZ, NZ, USER_NU);
 #if SEGMENTS
     double factor[SEGMENTS];
     factors_in(b->X, factor);
@@ -387,11 +396,12 @@ static int from_rest(NAME_workspace *w, Solve *b, const double *x, double until)
 
 /* The plan that is flown as the iterate, from now on, with its feedback in b->gains. */
 static void plan_before(NAME_workspace *w, Solve *b) {
-    memset(b->gains, 0, sizeof b->gains);
+    memset(b->gains, 0, sizeof b->gains); memset(w->x, 0, sizeof w->x);
+    copy_rows(w->x, NX, w->X, USER_NX, N + 1); copy_rows(w->u, NU, w->U, USER_NU, N);
 #if SEGMENTS
     double factor[SEGMENTS];
     factors_of(b, w->t, factor);
-    lift(w->X, w->U, factor, w->x, w->u);
+    put_factors(w->x, w->u, factor);
     b->arena.next = b->arena_begin;
     Left left = left_of(b, factor, w->age);
     move(&left, &b->problem, w->x, w->u);
@@ -400,8 +410,7 @@ static void plan_before(NAME_workspace *w, Solve *b) {
         b->gains[(k * NU + j) * NZ + i] = between(w->K, N, USER_NU * USER_NX, j * USER_NX + i, left.place[k]);
 #else
     double age = rounded(w->age);
-    for (int i = 0; i < N * NU; i++) for (int j = 0; j < NX; j++) b->gains[i * NZ + j] = w->K[i * NX + j];
-    memcpy(w->x, w->X, sizeof w->x); memcpy(w->u, w->U, sizeof w->u);
+    copy_rows(b->gains, NZ, w->K, USER_NX, N * NU);
     shift(w->x, 0, N + 1, NX, age); shift(w->u, 0, N, NU, age); shift(b->gains, 0, N, NU * NZ, age);
 #endif
 }
@@ -411,9 +420,16 @@ static int from_plan_before(NAME_workspace *w, Solve *b, const double *x, double
     double cost, violation;
     if (w->age < 0) return 0;
     plan_before(w, b);
-    follow(b, x, w->x, w->u, 1);
-    memcpy(w->u, b->U, sizeof w->u);
-    for (int64_t k = 0; k < N; k++) clamp(b, k, NU, w->u + k * NU);
+    if (!RATED) { /* feedback could break the bounds of rates */
+        follow(b, x, w->x, w->u, 1);
+        memcpy(w->u, b->U, sizeof w->u);
+    }
+    for (int64_t k = 0; k < N; k++) {
+        clamp(b, k, NU, w->u + k * NU);
+#if CARRIED
+        clamp_rates(b, k, w->u + (k ? k - 1 : 0) * NU, SEGMENTS ? w->x[k * NX + USER_NX] : 1, w->u + k * NU);
+#endif
+    }
     follow(b, x, w->x, w->u, 0);
     memcpy(w->x, b->X, sizeof w->x);
     no_multipliers(w);
@@ -452,17 +468,20 @@ static void hold(const NAME_workspace *w, const Solve *b, const double *x, doubl
         u[j] = b->rest[j];
         if (w->age < 0) continue;
         u[j] = share > 0 ? w->U[later * NU + j] * share + (1 - share) * w->U[k * NU + j] : w->U[k * NU + j];
-        for (int i = 0; x && i < NX; i++) {
-            double K = w->K[(k * NU + j) * NX + i], X = w->X[knot * NX + i];
+        for (int i = 0; x && !RATED && i < USER_NX; i++) {
+            double K = w->K[(k * NU + j) * USER_NX + i], X = w->X[knot * USER_NX + i];
             if (share > 0) {
-                K = w->K[(later * NU + j) * NX + i] * share + (1 - share) * K;
-                X = w->X[next * NX + i] * share + (1 - share) * X;
+                K = w->K[(later * NU + j) * USER_NX + i] * share + (1 - share) * K;
+                X = w->X[next * USER_NX + i] * share + (1 - share) * X;
             }
             u[j] += K * (x[i] - X);
         }
     }
 #endif
     if (w->age >= 0) clamp(b, k, USER_NU, u);
+#if CARRIED && !SEGMENTS
+    clamp_rates(b, 0, 0, 1, u);
+#endif
     clamp(b, 0, USER_NU, u);
 }
 
@@ -488,6 +507,10 @@ void NAME_reset(NAME_workspace *w) {
     w->age = -1;
     w->begun = w->able = 0;
     w->status = RUNNING; w->held = w->warm = w->iterations = 0; w->violation = 0;
+#ifdef PREVIOUS
+    const double *exported = (const double *)(const void *)(exported_numbers + unknown(ELEMENT(w)));
+    memcpy((double *)(void *)&w->numbers + PREVIOUS, exported + PREVIOUS, sizeof w->before);
+#endif
 #if HAS_PLAN
     int e = ELEMENT(w);
     NAME_guess(w, plan_X + e * (N + 1) * USER_NX, plan_U + e * N * USER_NU, plan_t + e * (N + 1));
@@ -503,20 +526,24 @@ void NAME_init(NAME_workspace *w@OF_ELEMENT@) {
 }
 
 void NAME_guess(NAME_workspace *w, const double *X, const double *U@OF_TIMES@) {
-#if SEGMENTS
-    double factor[SEGMENTS];
+    copy_rows(w->x, NX, X, USER_NX, N + 1); copy_rows(w->u, NU, U, USER_NU, N);
+#if SEGMENTS || CARRIED
     Solve *b = (Solve *)(void *)w->room;
     bind(w, b);
+#endif
+#if SEGMENTS
+    double factor[SEGMENTS];
     factors_of(b, t, factor);
-    lift(X, U, factor, w->x, w->u);
-#else
-    memcpy(w->x, X, sizeof w->x); memcpy(w->u, U, sizeof w->u);
+    put_factors(w->x, w->u, factor);
+#endif
+#if CARRIED
+    carry(b, w->x, w->u);
 #endif
     no_multipliers(w);
     w->able = 2;
 }
 
-int NAME_step(NAME_workspace *w, const double x[USER_NX], double moved, double max_seconds, double u[USER_NU]) {
+static int stepped(NAME_workspace *w, const double *x, double moved, double max_seconds, double *u) {
     Solve *b = (Solve *)(void *)w->room;
     bind(w, b);
     double until = seconds_of(&b->arena) + max_seconds;
@@ -529,7 +556,7 @@ int NAME_step(NAME_workspace *w, const double x[USER_NX], double moved, double m
     if (status < 0) {
         hold(w, b, status == NAME_BAD_STATE || bad == 2 ? 0 : x, u); /* without bounds feedback has no end */
         w->held = 1;
-        return w->status = status;
+        return status;
     }
     set_start(b, w->x, x);
     if (w->able && !(guessed && starts_inside(b, x))) {
@@ -549,5 +576,18 @@ int NAME_step(NAME_workspace *w, const double x[USER_NX], double moved, double m
     w->held = !good;
     if (good) { fly(w, b); flown(w, b, u); }
     else hold(w, b, x, u);
-    return w->status = status;
+    return status;
+}
+
+int NAME_step(NAME_workspace *w, const double x[USER_NX], double moved, double max_seconds, double u[USER_NU]) {
+#ifdef PREVIOUS
+    double *previous = (double *)(void *)&w->numbers + PREVIOUS;
+    if (moved == 0 && w->begun) memcpy(previous, w->before, sizeof w->before); /* once more for the same time */
+    else memcpy(w->before, previous, sizeof w->before);
+#endif
+    w->status = stepped(w, x, moved, max_seconds, u);
+#ifdef PREVIOUS
+    memcpy(previous, u, sizeof w->before);
+#endif
+    return w->status;
 }

@@ -41,7 +41,7 @@ typedef struct {
     /* The solver's own: where it begins, and room that only a step needs. */
     int begun, able;
     double x[@SIZE_x@], u[@SIZE_u@];
-@MULTIPLIERS@
+@MULTIPLIERS@@BEFORE@
     double room[@ROOM@];
 } NAME_workspace;
 
@@ -57,7 +57,7 @@ int NAME_step(NAME_workspace *w, const double x[NAME_NX], double @MOVES@, double
 /* The next step begins with this plan, of states X (N+1, NX) and controls U (N, NU)@GUESS_NAMED@, from any larger computer. */
 void NAME_guess(NAME_workspace *w, const double *X, const double *U@GUESS_TIMES@);
 
-/* Forgets the plan; numbers stay. */
+/* Forgets the plan; numbers stay, but for those that steps write. */
 void NAME_reset(NAME_workspace *w);
 
 #ifdef __cplusplus

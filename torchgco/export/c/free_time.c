@@ -45,13 +45,6 @@ static void put_factors(double *x, double *u, const double *factor) {
     }
 }
 
-/* States and controls of a plan, with its factors, as those of the solver. */
-static void lift(const double *X, const double *U, const double *factor, double *x, double *u) {
-    for (int k = 0; k <= N; k++) for (int i = 0; i < USER_NX; i++) x[k * NX + i] = X[k * USER_NX + i];
-    for (int k = 0; k < N; k++) for (int j = 0; j < USER_NU; j++) u[k * NU + j] = U[k * USER_NU + j];
-    put_factors(x, u, factor);
-}
-
 /* The times of the knots. */
 static void times_of(const double *factor, double *t) {
     t[0] = 0;
@@ -164,6 +157,9 @@ static void elapse(NAME_workspace *w, Solve *b, double seconds) {
     Left left = left_of(b, factor, seconds);
     move(&left, &b->problem, w->x, w->u);
     put_factors(w->x, w->u, left.factor);
+#if CARRIED
+    carry(b, w->x, w->u);
+#endif
     for (int i = 0; i < USER_CONSTRAINTS; i++) move_multipliers(&left, b, b->constraints + i);
 }
 
