@@ -18,16 +18,14 @@ from torchgco.fleets.among import Among
 from torchgco.fleets.coming_apart import ComingApart
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, aside
+from torchgco.fleets.negotiated import Negotiated
 from torchgco.fleets.plans import Plans, Solve
-from torchgco.fleets.prioritised import Prioritised
 from torchgco.fleets.shared_room import SharedRoom
 from torchgco.fleets.solution import FleetSolution
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet
 from torchgco.problem.known import Known
 
-ORDERS = 2  # times two orders in which the vehicles of a fleet plan, at most
-SAME = 0.02  # share by which the costs of two orders may differ: then others are no better
-RAISED = 2  # times as often as there are vehicles, one gets priority over all others, at most
+ORDERS = 2  # in which the vehicles of a fleet have turns, at most
 
 
 class _Best:
@@ -96,34 +94,27 @@ def solve_fleet(
                 near = apart.near.nonzero().flatten()
                 _improve(best, forms, rows[near], plans.take(near), late)
         if len(rows := best.open) > 0 and not late():
-            _one_after_other(best, forms, rows, seed, ids, late)
-            rows = rows[best.verdict.reached[rows]]
-            _improve(best, forms, rows, best.plans.take(rows), late)
+            _negotiate(best, forms, rows, seed, ids, late)
         _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
-def _one_after_other(
-    best: _Best, forms: list[Among], rows: Tensor, seed: int, ids: Tensor, late: Callable[[], bool]
-) -> None:
-    """Offer plans of prioritised planning in drawn orders, two at once: as long as orders matter, or none is sound."""
+def _negotiate(best: _Best, forms: list[Among], rows: Tensor, seed: int, ids: Tensor, late: Callable[[], bool]) -> None:
+    """Offer what vehicles negotiate that have turns in drawn orders: as long as none is sound."""
     rngs = {b: np.random.default_rng((seed, int(ids[b]))) for b in rows.tolist()}
     for _ in range(ORDERS):
         if len(rows) == 0 or late():
             return
-        of = rows.repeat_interleave(2)
-        orders = [rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
-        first, most = best.alone.take(of), RAISED * best.fleet.V
-        teams = Prioritised(best.fleet, forms, of, first, orders, late, raised=most).run()
-        pair = [best.offer(rows, teams.take(torch.arange(i, len(of), 2))) for i in range(2)]
-        same = (pair[0].cost - pair[1].cost).abs() <= SAME * pair[0].cost.abs()
-        rows = rows[~(same & pair[0].reached & pair[1].reached)]
+        orders = [rngs[b].permutation(best.fleet.V).tolist() for b in rows.tolist()]
+        plans = Negotiated(best.fleet, forms, rows, best.alone.take(rows), orders, late=late).run()
+        _improve(best, forms, rows, plans, late)
+        rows = rows[~best.verdict.reached[rows]]
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
     """Offer what sharing the room makes of plans for some fleets, (b,).
 
-    Where some vehicles are left a little too close, each of them plans again among all others.
+    Where some vehicles are left a little too close, they negotiate again.
     """
     for again in (True, False):
         if len(rows) == 0 or late():
@@ -135,12 +126,15 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
             return
         rows, plans = rows[left], plans.take(left)
         apart = judge_fleet(best.fleet.take(rows.tolist()), plans.U).apart
-        orders = [(~one).nonzero().flatten().tolist() for one in apart]
-        for turned in (False, True):
-            some = [order[::-1] if turned else order for order in orders]
-            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, plans).run())
-        rows = rows[best.verdict.reached[rows]]
-        plans = best.plans.take(rows)
+        due = [(~one).nonzero().flatten().tolist() for one in apart]
+        plans = _negotiated(best, forms, rows, plans, due, late)
+
+
+def _negotiated(
+    best: _Best, forms: list[Among], rows: Tensor, plans: Plans, due: list[list[int]], late: Callable[[], bool]
+) -> Plans:
+    orders = [list(range(best.fleet.V))] * len(rows)
+    return Negotiated(best.fleet, forms, rows, plans, orders, due, late).run()
 
 
 def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
@@ -149,11 +143,8 @@ def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
     rows = (best.verdict.reached & (2.0 * paid.amax(-1) > paid.sum(-1))).nonzero().flatten()
     if len(rows) == 0 or late():
         return
-    before, orders = best.verdict.cost[rows], [[v] for v in paid[rows].argmax(-1).tolist()]
-    first, now = best.alone.take(rows), best.plans.take(rows)
-    best.offer(rows, Prioritised(best.fleet, forms, rows, first, orders, late, now).run())
-    rows = rows[best.verdict.cost[rows] < before]
-    _improve(best, forms, rows, best.plans.take(rows), late)
+    due = [[v] for v in paid[rows].argmax(-1).tolist()]
+    _improve(best, forms, rows, _negotiated(best, forms, rows, best.plans.take(rows), due, late), late)
 
 
 def _late(ends: float | None) -> bool:
