@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from torchgco.fleets.fleet import Fleet
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
@@ -103,18 +104,19 @@ class Among:
         goals = [part for part in one.constraints if part.is_goal]
         return one._with({"constraints": (*parts, others, *goals)}, known=self.known)
 
-    def ground(self, row: int, others: Tensor, radii: Tensor, free: Tensor) -> Ground | None:
-        """The lattice of the problem at a row without the others; None where none can be searched.
+    def ground_of(self, fleet: Fleet, v: int, b: int, free: Tensor, p: Tensor) -> Ground | None:
+        """The lattice of vehicle v of fleet b, without the others; None where none can be searched.
 
         Args:
-            others: where these are, (M, N+1, d): the first time that the row is asked for, their sizes count.
-            radii: what is kept from them, (M,), m.
-            free: states (N+1, n) of it alone.
+            free: states (N+1, n) of it, which say how fast it is.
+            p: where all vehicles are, (V, N+1, d): the first time that it is asked for, how large they are counts.
         """
+        row = fleet.row_of(v, b)
         if row not in self.grounds:
-            at = torch.tensor([row])
-            own = 0.5 * radii.amin().unsqueeze(0)  # a lattice is as fine as this
-            with_others = self.at(at, others.transpose(0, 1).unsqueeze(0), radii.unsqueeze(0), own=own)
+            others, at = fleet.distances[v] > 0, torch.tensor([row])
+            radii = fleet.distances[v][others].unsqueeze(0)
+            own = 0.5 * radii.amin(-1)  # a lattice is as fine as this
+            with_others = self.at(at, p[others].transpose(0, 1).unsqueeze(0), radii, own=own)
             self.grounds[row] = Ground.of(self.problem.take(at), with_others, free)
         return self.grounds[row]
 

@@ -56,7 +56,6 @@ class Negotiated:
     ) -> None:
         C, V = len(of), fleet.V
         self.fleet, self.forms, self.of, self.orders, self.late = fleet, forms, of, orders, late
-        self.form_of = {v: (i, at) for i, (_, whose) in enumerate(fleet.forms) for at, v in enumerate(whose)}
         self.due = [list(some) for some in due] if due is not None else [[] for _ in orders]
         self.plans = plans.take(torch.arange(C))
         self.p = fleet.places(plans.X)  # (C, V, N+1, d)
@@ -96,10 +95,8 @@ class Negotiated:
         return least < CONTACT_FACTOR * self.fleet.distances[v]
 
     def _ground(self, c: int, v: int) -> Ground | None:
-        i, at = self.form_of[v]
-        others = self.fleet.distances[v] > 0
-        radii, free = self.fleet.distances[v][others], self.plans.X[v][c]
-        return self.forms[i].ground(at * self.fleet.B + int(self.of[c]), self.p[c][others], radii, free)
+        among = self.forms[self.fleet.form_of[v][0]]
+        return among.ground_of(self.fleet, v, int(self.of[c]), self.plans.X[v][c], self.p[c])
 
     def _scene(self, c: int, v: int) -> TimedScene:
         """The lattice of a vehicle among the present ways of the others."""

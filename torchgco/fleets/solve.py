@@ -20,12 +20,12 @@ from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, aside
 from torchgco.fleets.negotiated import Negotiated
 from torchgco.fleets.plans import Plans, Solve
+from torchgco.fleets.replanned import Replanned
 from torchgco.fleets.shared_room import SharedRoom
 from torchgco.fleets.solution import FleetSolution
-from torchgco.fleets.verdict import FleetVerdict, judge_fleet
+from torchgco.fleets.verdict import FleetVerdict, judge_fleet, served
 from torchgco.problem.known import Known
 
-ORDERS = 2  # in which the vehicles of a fleet have turns, at most
 
 
 class _Best:
@@ -87,34 +87,42 @@ def solve_fleet(
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
         best, forms = _Best(fleet, first), [Among(one, Known()) for one, _ in fleet.forms]
+        rngs = {b: np.random.default_rng((seed, int(ids[b]))) for b in best.open.tolist()}
         for side in SIDES:
-            if len(rows := best.open) > 0 and not late():
-                apart = ComingApart(fleet, forms, rows, aside(fleet, forms, rows, first.take(rows), side), late)
-                plans = apart.run()
-                near = apart.near.nonzero().flatten()
-                _improve(best, forms, rows[near], plans.take(near), late)
-        if len(rows := best.open) > 0 and not late():
-            _negotiate(best, forms, rows, seed, ids, late)
+            _come_apart(best, forms, side, late)
+            _negotiate(best, forms, rngs, late)
         _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
-def _negotiate(best: _Best, forms: list[Among], rows: Tensor, seed: int, ids: Tensor, late: Callable[[], bool]) -> None:
-    """Offer what vehicles negotiate that have turns in drawn orders: as long as none is sound."""
-    rngs = {b: np.random.default_rng((seed, int(ids[b]))) for b in rows.tolist()}
-    for _ in range(ORDERS):
-        if len(rows) == 0 or late():
-            return
-        orders = [rngs[b].permutation(best.fleet.V).tolist() for b in rows.tolist()]
-        plans = Negotiated(best.fleet, forms, rows, best.alone.take(rows), orders, late=late).run()
-        _improve(best, forms, rows, plans, late)
-        rows = rows[~best.verdict.reached[rows]]
+def _come_apart(best: _Best, forms: list[Among], side: float, late: Callable[[], bool]) -> None:
+    """Offer what becomes of fleets that aren't sound where all vehicles pass each other on a side."""
+    rows = best.open
+    if len(rows) == 0 or late():
+        return
+    guesses = aside(best.fleet, forms, rows, best.alone.take(rows), side)
+    apart = ComingApart(best.fleet, forms, rows, guesses, late)
+    plans = apart.run()
+    near = apart.near.nonzero().flatten()
+    _improve(best, forms, rows[near], plans.take(near), late)
+
+
+def _negotiate(
+    best: _Best, forms: list[Among], rngs: dict[int, np.random.Generator], late: Callable[[], bool]
+) -> None:
+    """Offer what the vehicles of fleets that aren't sound negotiate, with turns in a drawn order."""
+    rows = best.open
+    if len(rows) == 0 or late():
+        return
+    orders = [rngs[b].permutation(best.fleet.V).tolist() for b in rows.tolist()]
+    plans = Negotiated(best.fleet, forms, rows, best.alone.take(rows), orders, late=late).run()
+    _improve(best, forms, rows, plans, late)
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
     """Offer what sharing the room makes of plans for some fleets, (b,).
 
-    Where some vehicles are left a little too close, they negotiate again.
+    Where some vehicles are left a little too close, each of them plans again among all others.
     """
     for again in (True, False):
         if len(rows) == 0 or late():
@@ -125,16 +133,14 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
         if len(left) == 0 or not again:
             return
         rows, plans = rows[left], plans.take(left)
-        apart = judge_fleet(best.fleet.take(rows.tolist()), plans.U).apart
-        due = [(~one).nonzero().flatten().tolist() for one in apart]
-        plans = _negotiated(best, forms, rows, plans, due, late)
-
-
-def _negotiated(
-    best: _Best, forms: list[Among], rows: Tensor, plans: Plans, due: list[list[int]], late: Callable[[], bool]
-) -> Plans:
-    orders = [list(range(best.fleet.V))] * len(rows)
-    return Negotiated(best.fleet, forms, rows, plans, orders, due, late).run()
+        verdict = judge_fleet(best.fleet.take(rows.tolist()), plans.U)
+        known = served(best.fleet, verdict.vehicles)
+        orders = [(~one).nonzero().flatten().tolist() for one in known & verdict.apart]
+        for turned in (False, True):
+            some = [order[::-1] if turned else order for order in orders]
+            best.offer(rows, Replanned(best.fleet, forms, rows, plans, some, known, late).run())
+        rows = rows[best.verdict.reached[rows]]
+        plans = best.plans.take(rows)
 
 
 def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
@@ -144,7 +150,8 @@ def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
     if len(rows) == 0 or late():
         return
     due = [[v] for v in paid[rows].argmax(-1).tolist()]
-    _improve(best, forms, rows, _negotiated(best, forms, rows, best.plans.take(rows), due, late), late)
+    orders = [list(range(best.fleet.V))] * len(rows)
+    _improve(best, forms, rows, Negotiated(best.fleet, forms, rows, best.plans.take(rows), orders, due, late).run(), late)
 
 
 def _late(ends: float | None) -> bool:
