@@ -20,7 +20,17 @@ from torchgco import (
     Spheres,
 )
 from torchgco.native.engine import run
-from torchgco.roadmap.timed import FAR, PARTS, Surroundings, TimedLattice, TimedScene, field_of, library_for, timed_ways
+from torchgco.roadmap.timed import (
+    FAR,
+    PARTS,
+    Others,
+    Surroundings,
+    TimedLattice,
+    TimedScene,
+    field_of,
+    library_for,
+    timed_ways,
+)
 
 SPACING, TAU, MARGIN = 0.5, 0.5, 0.05
 
@@ -64,6 +74,18 @@ def drawn(counts: tuple[int, ...], layers: int, seed: int, ends: int = 1) -> Tim
     return scene_of(lattice, (gap, cost, end, move, last, change), 0, first, MARGIN)
 
 
+def tolls(scene: TimedScene) -> np.ndarray:
+    """What being at each cell at each part costs."""
+    paid = np.zeros(scene.field.away.shape)
+    if scene.others is not None:
+        for center, reach, price in zip(
+            scene.others.center.transpose(0, 1), scene.others.reach, scene.others.price, strict=True
+        ):
+            away = np.linalg.norm(scene.lattice.points - center.numpy()[:, None], axis=-1)
+            paid += float(price) / PARTS * np.maximum(0.0, 1.0 - away / float(reach))
+    return paid
+
+
 def reference(scene: TimedScene) -> np.ndarray:
     a = scene.lattice
     counts, least, most = (tuple(int(n) for n in part) for part in (a.counts, a.least, a.most))
@@ -71,7 +93,7 @@ def reference(scene: TimedScene) -> np.ndarray:
     cost, end = (np.where(part < FAR, part, np.inf) for part in parts)
     ways = Ways(
         counts, least, most, PARTS, MARGIN, scene.field.away.numpy().astype(float).reshape(-1, *counts),
-        cost, end, {}, {}, tuple(scene.change[: a.d].tolist()),
+        cost, end, {}, {}, tuple(scene.change[: a.d].tolist()), tolls(scene).reshape(-1, *counts),
     )  # fmt: skip
     finite = lambda v: float(v) if v < FAR else np.inf
     ways.move_cost = dict(zip(ways.moves, map(finite, scene.move_cost.tolist()), strict=True))
@@ -96,6 +118,26 @@ def test_costs_through_all_states_are_those_of_plain_dynamic_programming(counts,
     assert some.any() and (~some).any()
     assert np.array_equal(got.numpy() < FAR, some) and np.allclose(got.numpy()[some], due[some], atol=1e-4)
     assert one.found >= 1
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(
+    ("counts", "layers", "seed", "ends"), [((6, 5), 6, 0, 1), ((7, 4), 5, 2, 6), ((3, 4, 3), 4, 4, 3)]
+)
+def test_the_cheapest_way_among_others_that_may_be_met_at_a_price(counts, layers, seed, ends) -> None:
+    """As plain dynamic programming with tolls; where they are large, it goes elsewhere."""
+    scene, rng = drawn(counts, layers, seed, ends), np.random.default_rng(seed)
+    T, d = layers * PARTS + 1, len(counts)
+    center = torch.from_numpy(rng.uniform(0, SPACING * np.array(counts), (2, d)) + np.zeros((T, 1, 1)))
+    center += 0.3 * SPACING * torch.arange(T).view(-1, 1, 1) / PARTS
+    costs = []
+    for price in (0.0, 0.3, 3.0):
+        others = Others(center, torch.tensor([0.8, 1.1]), torch.tensor([price, 2.0 * price]))
+        met = replace(scene, others=others)
+        (found,) = timed_ways([met], 1, 0.0)
+        assert float(found.costs[0]) == pytest.approx(reference(met).min(), abs=1e-4) and len(found.points) == 1
+        costs.append(float(found.costs[0]))
+    assert costs[0] == pytest.approx(reference(scene).min(), abs=1e-4) and costs[0] < costs[1] < costs[2]
 
 
 def wall(opens: tuple[float, float], closes: float = np.inf) -> TimedScene:

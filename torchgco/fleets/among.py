@@ -79,7 +79,7 @@ class Among:
 
     problem: Problem
     known: Known
-    grounds: dict[int, Ground | None] = field(default_factory=dict)  # lattices of problems at some rows
+    grounds: dict[int, Ground | None] = field(default_factory=dict)  # of problems at some rows
 
     def at(
         self,
@@ -104,19 +104,19 @@ class Among:
         goals = [part for part in one.constraints if part.is_goal]
         return one._with({"constraints": (*parts, others, *goals)}, known=self.known)
 
-    def ground_of(self, fleet: Fleet, v: int, b: int, free: Tensor, p: Tensor) -> Ground | None:
+    def ground(self, fleet: Fleet, v: int, b: int, free: Tensor) -> Ground | None:
         """The lattice of vehicle v of fleet b, without the others; None where none can be searched.
 
         Args:
             free: states (N+1, n) of it, which say how fast it is.
-            p: where all vehicles are, (V, N+1, d): the first time that it is asked for, how large they are counts.
         """
         row = fleet.row_of(v, b)
         if row not in self.grounds:
-            others, at = fleet.distances[v] > 0, torch.tensor([row])
-            radii = fleet.distances[v][others].unsqueeze(0)
-            own = 0.5 * radii.amin(-1)  # a lattice is as fine as this
-            with_others = self.at(at, p[others].transpose(0, 1).unsqueeze(0), radii, own=own)
+            at, keep = torch.tensor([row]), fleet.distances[v]
+            radii = keep[keep > 0].unsqueeze(0)
+            # How large the others are counts, and not where they are: a lattice is as fine as half of what is kept.
+            places = free[None, :, None, self.problem.position].repeat(1, 1, radii.shape[1], 1)
+            with_others = self.at(at, places, radii, own=0.5 * radii.amin(-1))
             self.grounds[row] = Ground.of(self.problem.take(at), with_others, free)
         return self.grounds[row]
 

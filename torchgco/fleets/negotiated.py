@@ -24,8 +24,8 @@ from torchgco.search.timed import guesses_along, smooth
 
 FIRST_PRICE = 0.25  # of being all the way inside another one for a layer, as a share of the most that a layer costs
 DEARER = 4.0  # times, where two still meet after one of them has planned
-DEAREST = 1e4  # times the first price, at most: single numbers add up no more
-TURNS = 16  # a vehicle, at most
+DEAREST = 1e4  # times the first price, at most: single numbers would lose all other costs
+TURNS = 16  # of each vehicle, at most
 
 
 class Negotiated:
@@ -39,9 +39,6 @@ class Negotiated:
         orders: of its vehicles, in which those that meet others have turns.
         due: vehicles of each team that have a turn in any case, before all others.
         late: whether the time is over.
-
-    Attributes:
-        cost: of all ways, on the lattices or as planned at first, (C,).
     """
 
     def __init__(
@@ -76,10 +73,18 @@ class Negotiated:
         self._follow()
         return self.plans
 
+    @property
+    def cost(self) -> Tensor:
+        """Of the plans of each team, (C,); infinite where vehicles still meet."""
+        each = zip(self.fleet.members, self.plans.X, self.plans.U, strict=True)
+        cost = torch.stack([one.take(self.of).cost.total(x, u) for one, x, u in each]).sum(0)
+        return torch.where(self.meets.flatten(1).any(-1), torch.inf, cost.nan_to_num(torch.inf))
+
     def _whose_turn(self, c: int) -> int | None:
         """The next vehicle of a team that is due, or meets another one; None: nobody."""
-        if self.due[c]:
-            return self.due[c].pop(0)
+        while self.due[c]:
+            if self._ground(c, v := self.due[c].pop(0)) is not None:
+                return v
         order, meets = self.orders[c], self.meets[c].any(-1)
         for i in range(len(order)):
             at = (self.next[c] + i) % len(order)
@@ -96,7 +101,7 @@ class Negotiated:
 
     def _ground(self, c: int, v: int) -> Ground | None:
         among = self.forms[self.fleet.form_of[v][0]]
-        return among.ground_of(self.fleet, v, int(self.of[c]), self.plans.X[v][c], self.p[c])
+        return among.ground(self.fleet, v, int(self.of[c]), self.plans.X[v][c])
 
     def _scene(self, c: int, v: int) -> TimedScene:
         """The lattice of a vehicle among the present ways of the others."""
@@ -122,10 +127,10 @@ class Negotiated:
     def _follow(self) -> None:
         """States and controls along the ways."""
         for among, (_, whose) in zip(self.forms, self.fleet.forms, strict=True):
-            for at, v in enumerate(whose):
-                rows = [c for c in range(len(self.of)) if self.ways[c][v] is not None]
-                found = [ways for c in rows if (ways := self.ways[c][v]) is not None]
+            for place, v in enumerate(whose):
+                found = {c: ways for c, team in enumerate(self.ways) if (ways := team[v]) is not None}
                 if found:
-                    problem = among.problem.take(at * self.fleet.B + self.of[rows])
-                    X, U = guesses_along(problem, torch.arange(len(rows)), found)
-                    self.plans.X[v][rows], self.plans.U[v][rows] = X, U
+                    rows = list(found)
+                    problem = among.problem.take(place * self.fleet.B + self.of[rows])
+                    guesses = guesses_along(problem, torch.arange(len(rows)), list(found.values()))
+                    self.plans.X[v][rows], self.plans.U[v][rows] = guesses

@@ -1,4 +1,7 @@
-"""Vehicles that plan again one after the other, from where they are, each among the present motions of all others."""
+"""Vehicles that plan again one after the other, from where they are, each among the present motions of the others.
+
+M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987).
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ from torch import Tensor
 from torchgco.constraints.base import ADMITTED
 from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.negotiated import DEAREST
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
-from torchgco.fleets.negotiated import DEAREST
 from torchgco.kernels import path_clearance
 from torchgco.problem.problem import Problem
 from torchgco.roadmap.timed import TimedScene, timed_ways
@@ -34,6 +37,9 @@ class Replanned:
         orders: in which some of its vehicles plan, of each team.
         known: which vehicles others plan among from the beginning, (C, V) bool; others they do once these have planned.
         late: whether the time is over.
+
+    Attributes:
+        lost: vehicles of each team that have found no plan.
     """
 
     def __init__(
@@ -48,7 +54,7 @@ class Replanned:
     ) -> None:
         self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
         self.left, self.plans = [list(order) for order in orders], plans.take(torch.arange(len(of)))
-        self.known = known.clone()
+        self.known, self.lost = known.clone(), [list[int]() for _ in orders]
         each = zip(fleet.members, self.plans.X, self.plans.U, strict=True)
         self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
 
@@ -65,9 +71,13 @@ class Replanned:
     def _plan(self, form: int, teams: Tensor, vehicles: Tensor) -> None:
         """Plan a vehicle of each of some teams, all of one form: from where it is, else along a way on its lattice."""
         turn = _Turn(self, form, teams, vehicles)
-        left = turn.solve(torch.arange(len(teams)))
+        turn.solve(torch.arange(len(teams)))
+        left = (~turn.found).nonzero().flatten()
         if len(left) and not self.late():
             turn.solve(turn.along_ways(left))
+        for (c, v), found in zip(turn.pairs, turn.found.tolist(), strict=True):
+            if not found:
+                self.lost[c].append(v)
 
 
 class _Turn:
@@ -83,42 +93,43 @@ class _Turn:
         self.p = torch.where(there[:, None, :, None], p, torch.nan)
         self.radii = torch.where(there, keep + run.off[teams], torch.nan)
         self.X, self.U = (torch.stack([part[v][c] for c, v in self.pairs]) for part in (run.plans.X, run.plans.U))
+        self.found = torch.zeros(len(self.pairs), dtype=torch.bool)
 
     def along_ways(self, rows: Tensor) -> Tensor:
-        """Guesses for some vehicles along ways on their lattices; for which there are some."""
-        run, grounds, scenes = self.run, list[int](), list[TimedScene]()
+        """Guess some vehicles to go along the cheapest ways on their lattices; those for which there is one."""
+        run, scenes = self.run, dict[int, TimedScene]()
         for i in rows.tolist():
-            c, v = self.pairs[i]
-            ground = self.among.ground_of(run.fleet, v, int(run.of[c]), run.plans.X[v][c], run.fleet.places([x[[c]] for x in run.plans.X])[0])
-            others = ~self.radii[i].isnan()
+            (c, v), there = self.pairs[i], ~self.radii[i].isnan()
+            ground = self.among.ground(run.fleet, v, int(run.of[c]), run.plans.X[v][c])
             if ground is not None:
-                price = torch.full_like(self.radii[i][others], DEAREST * ground.most)
-                scenes.append(ground.among(self.p[i][:, others].transpose(0, 1), self.radii[i][others], price, run.fleet.dt))
-                grounds.append(i)
-        found = [(i, ways) for i, ways in zip(grounds, timed_ways(scenes, 1, 0.0), strict=True) if ways.points]
-        chosen = torch.tensor([i for i, _ in found], dtype=torch.int64)
-        if len(found):
+                p, radii = self.p[i][:, there].transpose(0, 1), self.radii[i][there]
+                price = torch.full_like(radii, DEAREST * ground.most)
+                scenes[i] = ground.among(p, radii, price, run.fleet.dt)
+        searched = zip(scenes, timed_ways(list(scenes.values()), 1, 0.0), strict=True)
+        found = {i: ways for i, ways in searched if ways.points}
+        chosen = torch.tensor(list(found), dtype=torch.int64)
+        if found:
             problem = self.among.problem.take(self.rows[chosen])
-            self.X[chosen], self.U[chosen] = guesses_along(problem, torch.arange(len(found)), [ways for _, ways in found])
+            guesses = guesses_along(problem, torch.arange(len(found)), list(found.values()))
+            self.X[chosen], self.U[chosen] = guesses
         return chosen
 
-    def solve(self, left: Tensor) -> Tensor:
-        """Solve from the guesses of some vehicles, and keep what is sound; those for which nothing is."""
-        X, U, grown, lost = self.X.clone(), self.U.clone(), torch.zeros(len(self.rows), dtype=self.X.dtype), left
+    def solve(self, left: Tensor) -> None:
+        """Solve from the guesses of some vehicles, and keep what is sound."""
+        X, U, grown = self.X.clone(), self.U.clone(), torch.zeros(len(self.rows), dtype=self.X.dtype)
         for _ in range(1 + REPAIRS if len(left) else 0):
             larger = self.among.at(self.rows[left], self.p[left], self.radii[left] + grown[left].unsqueeze(-1))
             solution = SOLVER.solve(larger, U[left], X0=X[left])
             fine, touch = arrives(self.among.at(self.rows[left], self.p[left], self.radii[left]), solution)
             for place, i in enumerate(left.tolist()):
                 self._take(i, solution, place, bool(fine[place]))
-            lost = lost[~torch.isin(lost, left[fine])]
+            self.found[left] = fine
             again = ~fine & (touch < 0) & (solution.violation <= ADMITTED)
             X[left], U[left] = solution.X, solution.U
             grown[left[again]] += BEYOND * -touch[again] + MORE
             left = left[again]
             if not len(left):
                 break
-        return lost
 
     def _take(self, i: int, solution: Solution, place: int, fine: bool) -> None:
         (c, v), run = self.pairs[i], self.run

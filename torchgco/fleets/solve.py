@@ -1,4 +1,4 @@
-"""From a fleet to its trajectories: each alone, all together, and one after the other where that doesn't do."""
+"""From a fleet to its trajectories: each alone, all together, and by negotiations where that doesn't do."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from torchgco.fleets.solution import FleetSolution
 from torchgco.fleets.verdict import FleetVerdict, judge_fleet, served
 from torchgco.problem.known import Known
 
+DRAWN = 2  # orders of turns in which vehicles negotiate
+ORDERS = 4  # in which vehicles plan again, at most
 
 
 class _Best:
@@ -107,16 +109,16 @@ def _come_apart(best: _Best, forms: list[Among], side: float, late: Callable[[],
     _improve(best, forms, rows[near], plans.take(near), late)
 
 
-def _negotiate(
-    best: _Best, forms: list[Among], rngs: dict[int, np.random.Generator], late: Callable[[], bool]
-) -> None:
-    """Offer what the vehicles of fleets that aren't sound negotiate, with turns in a drawn order."""
+def _negotiate(best: _Best, forms: list[Among], rngs: dict[int, np.random.Generator], late: Callable[[], bool]) -> None:
+    """Offer what the vehicles of fleets that aren't sound negotiate: of drawn orders of turns the cheapest."""
     rows = best.open
     if len(rows) == 0 or late():
         return
-    orders = [rngs[b].permutation(best.fleet.V).tolist() for b in rows.tolist()]
-    plans = Negotiated(best.fleet, forms, rows, best.alone.take(rows), orders, late=late).run()
-    _improve(best, forms, rows, plans, late)
+    of = rows.repeat_interleave(DRAWN)
+    orders = [rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
+    teams = Negotiated(best.fleet, forms, of, best.alone.take(of), orders, late=late)
+    plans, least = teams.run(), teams.cost.view(-1, DRAWN).argmin(-1)
+    _improve(best, forms, rows, plans.take(DRAWN * torch.arange(len(rows)) + least), late)
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
@@ -133,25 +135,42 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
         if len(left) == 0 or not again:
             return
         rows, plans = rows[left], plans.take(left)
-        verdict = judge_fleet(best.fleet.take(rows.tolist()), plans.U)
-        known = served(best.fleet, verdict.vehicles)
-        orders = [(~one).nonzero().flatten().tolist() for one in known & verdict.apart]
-        for turned in (False, True):
-            some = [order[::-1] if turned else order for order in orders]
-            best.offer(rows, Replanned(best.fleet, forms, rows, plans, some, known, late).run())
+        _plan_again(best, forms, rows, plans, late)
         rows = rows[best.verdict.reached[rows]]
         plans = best.plans.take(rows)
 
 
+def _plan_again(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
+    """Offer what becomes of fleets, (b,), whose vehicles that aren't sound plan again one after the other.
+
+    Both ends of what is in conflict begin; after that, whoever has found no plan.
+    """
+    verdict = judge_fleet(best.fleet.take(rows.tolist()), plans.U)
+    known = served(best.fleet, verdict.vehicles)
+    orders = [(~one).nonzero().flatten().tolist() for one in known & verdict.apart]
+    for i in range(ORDERS):
+        run = Replanned(best.fleet, forms, rows, plans, orders, known, late)
+        best.offer(rows, run.run())
+        if i == 0:
+            orders = [order[::-1] for order in orders]
+            continue
+        left = (~best.verdict.reached[rows]).nonzero().flatten()
+        if len(left) == 0:
+            return
+        orders = [run.lost[c] + [v for v in orders[c] if v not in run.lost[c]] for c in left.tolist()]
+        rows, plans, known = rows[left], plans.take(left), known[left]
+
+
 def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
-    """Where one vehicle pays more for the others than all of these together, it plans again among them."""
+    """Where one vehicle pays more for the others than all of these together, it goes another way, and who meets it."""
     paid = best.costs - best.least
     rows = (best.verdict.reached & (2.0 * paid.amax(-1) > paid.sum(-1))).nonzero().flatten()
     if len(rows) == 0 or late():
         return
     due = [[v] for v in paid[rows].argmax(-1).tolist()]
     orders = [list(range(best.fleet.V))] * len(rows)
-    _improve(best, forms, rows, Negotiated(best.fleet, forms, rows, best.plans.take(rows), orders, due, late).run(), late)
+    plans = Negotiated(best.fleet, forms, rows, best.plans.take(rows), orders, due, late).run()
+    _improve(best, forms, rows, plans, late)
 
 
 def _late(ends: float | None) -> bool:

@@ -167,12 +167,12 @@ class TimedScene:
             counts=counts, least=least, moves=moves, layers=a.layers, parts=PARTS, start=self.start, first=self.first,
             earliest=a.layers + 1 - len(self.end_cost), spacing=a.spacing, margin=self.margin, dearer=dearer,
             solids=len(field.radius), resting=field.resting, center=field.center, half=field.half, axes=field.axes,
-            radius=field.radius, **self._met(), clearance=field.away.clone(), cell_cost=self.cell_cost, end_cost=self.end_cost,
-            move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most, tries=TRIES, found=0,
+            radius=field.radius, **self._met(), clearance=field.away.clone(), cell_cost=self.cell_cost,
+            end_cost=self.end_cost, move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most,
+            tries=TRIES, found=0,
             way=torch.empty(most, a.layers + 1, dtype=torch.int32), end=torch.empty(most, dtype=torch.int32),
             cost=torch.empty(most, dtype=torch.float32),
         )  # fmt: skip
-
 
     def _met(self) -> dict[str, Any]:
         if self.others is None:
