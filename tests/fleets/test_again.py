@@ -36,7 +36,7 @@ def test_who_pays_more_than_all_others_plans_again() -> None:
     status = torch.zeros(2, 3, dtype=torch.int64)
     plans = Plans([s.X for s in found], [s.U for s in found], [s.K for s in found], status, status.clone())
     plans.set(2, torch.tensor([1]), detour, torch.tensor([1]))
-    best = _Best(fleet, alone(fleet, torchgco.solve, 0, both, "gco"))
+    best = _Best(fleet, alone(fleet, torchgco.solve, 0, both, "gco"), 0, both)
     best.offer(both, plans)
     assert bool(best.verdict.reached.all())
     before = best.verdict.cost.clone()

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import torchgco
+from benchmarks.families.fleet_scenes import discs
 from tests.fleets.scenes import DISC, D, disc
 from torchgco import Boxes, Fleet, Spheres
 from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets import solve
 from torchgco.fleets.among import BESIDE, SOLVER, Among
-from torchgco.fleets.drawn import fleet_of
 from torchgco.fleets.forces import responses
 from torchgco.fleets.negotiated import TURNS, Negotiated
 from torchgco.fleets.replanned import Replanned
@@ -23,7 +23,6 @@ from torchgco.fleets.verdict import judge_fleet
 from torchgco.lagrangian.kkt import RightSides
 from torchgco.problem.known import Known
 from torchgco.roadmap.timed import PARTS, library_for
-from torchgco.scenarios import FleetDoor, Vehicle
 from torchgco.sensitivity.points import rows_that_hold, solve_at
 
 ONE = torch.tensor([0])
@@ -60,7 +59,7 @@ def test_ways_are_negotiated_until_nobody_meets_another_one() -> None:
         assert torch.equal(teams.cost, own)
         p = fleet.places(plans.X)[0]
         assert float((p[0] - p[1]).norm(dim=-1).min()) > 0.95 * 0.4
-        best, forms = solve._Best(fleet, first), forms_of(fleet)
+        best, forms = solve._Best(fleet, first, 0, ONE), forms_of(fleet)
         solve._improve(best, forms, ONE, plans, lambda: False)
         assert bool(best.verdict.reached[0])
 
@@ -77,9 +76,8 @@ def test_negotiations_do_not_depend_on_other_fleets() -> None:
     whole, found = in_the_door(2.5, 2.2), []
     for fleet, ids in ((whole, torch.arange(2)), (whole.take([1]), torch.tensor([1]))):
         first = alone(fleet, torchgco.solve, 0, ids, torchgco.InteriorPoint())
-        best = solve._Best(fleet, first)
-        rngs = {b: np.random.default_rng((0, int(ids[b]))) for b in range(fleet.B)}
-        solve._negotiate(best, forms_of(fleet), rngs, lambda: False)
+        best = solve._Best(fleet, first, 0, ids)
+        solve._negotiate(best, forms_of(fleet), lambda: False)
         found.append(best)
     assert bool(found[0].verdict.reached.all())
     for mine, yours in zip(found[1].plans.U, found[0].plans.U, strict=True):
@@ -99,8 +97,7 @@ def test_a_negotiation_about_a_goal_inside_a_wall_ends() -> None:
 
 @pytest.mark.slow
 def test_a_door_of_24_is_negotiated() -> None:
-    vehicle = Vehicle.disc()
-    fleet = fleet_of(vehicle, FleetDoor(vehicles=24).draw(1, seed=2718))
+    fleet = discs("door", 24, 1, 2718)
     first = alone(fleet, torchgco.solve, 0, ONE, "gco")
     order = np.random.default_rng(0).permutation(24).tolist()
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [order])

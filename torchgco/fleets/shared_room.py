@@ -149,8 +149,10 @@ class SharedRoom:
         self.best.put(rows[best], new.take(best))
         self.least[rows[best]] = cost[best]
         small = sound & better & self.sound[rows] & (gain < LEAST_GAIN * cost.abs())
+        # What touches obstacles alone is a better guess than one that others came too close in.
+        nearer = (better | (keeps & ~self.sound[rows])).nonzero().flatten()
+        self.now.put(rows[nearer], new.take(nearer))
         kept = better.nonzero().flatten()
-        self.now.put(rows[kept], new.take(kept))
         self.cost[rows[kept]], self.sound[rows[kept]] = cost[kept], sound[kept]
         whole = better & (self.step[rows] >= 1.0)
         self.needed[rows[whole]] += short[whole]

@@ -28,12 +28,14 @@ from torchgco.problem.known import Known
 
 DRAWN = 2  # orders of turns in which vehicles negotiate
 ORDERS = 4  # in which vehicles plan again, at most
+SAME = 0.02  # share by which the costs of two orders may differ: then others are no better
 
 
 class _Best:
     """The best plans of every fleet so far."""
 
-    def __init__(self, fleet: Fleet, plans: Plans) -> None:
+    def __init__(self, fleet: Fleet, plans: Plans, seed: int, ids: Tensor) -> None:
+        self.rngs = [np.random.default_rng((seed, number)) for number in ids.tolist()]
         self.fleet, self.alone, self.plans = fleet, plans, plans.take(torch.arange(fleet.B))
         self.verdict = judge_fleet(fleet, plans.U)
         self.least = self.costs  # (B, V), of vehicles alone
@@ -88,11 +90,10 @@ def solve_fleet(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
-        best, forms = _Best(fleet, first), [Among(one, Known()) for one, _ in fleet.forms]
-        rngs = {b: np.random.default_rng((seed, int(ids[b]))) for b in best.open.tolist()}
+        best, forms = _Best(fleet, first, seed, ids), [Among(one, Known()) for one, _ in fleet.forms]
         for side in SIDES:
             _come_apart(best, forms, side, late)
-            _negotiate(best, forms, rngs, late)
+            _negotiate(best, forms, late)
         _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
@@ -109,13 +110,13 @@ def _come_apart(best: _Best, forms: list[Among], side: float, late: Callable[[],
     _improve(best, forms, rows[near], plans.take(near), late)
 
 
-def _negotiate(best: _Best, forms: list[Among], rngs: dict[int, np.random.Generator], late: Callable[[], bool]) -> None:
+def _negotiate(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
     """Offer what the vehicles of fleets that aren't sound negotiate: of drawn orders of turns the cheapest."""
     rows = best.open
     if len(rows) == 0 or late():
         return
     of = rows.repeat_interleave(DRAWN)
-    orders = [rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
+    orders = [best.rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
     teams = Negotiated(best.fleet, forms, of, best.alone.take(of), orders, late=late)
     plans, least = teams.run(), teams.cost.view(-1, DRAWN).argmin(-1)
     _improve(best, forms, rows, plans.take(DRAWN * torch.arange(len(rows)) + least), late)
@@ -143,22 +144,28 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
 def _plan_again(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
     """Offer what becomes of fleets, (b,), whose vehicles that aren't sound plan again one after the other.
 
-    Both ends of what is in conflict begin; after that, whoever has found no plan.
+    Both ends of what is in conflict begin; after that, whoever has found no plan. It ends where order doesn't matter.
     """
     verdict = judge_fleet(best.fleet.take(rows.tolist()), plans.U)
     known = served(best.fleet, verdict.vehicles)
     orders = [(~one).nonzero().flatten().tolist() for one in known & verdict.apart]
+    before = torch.full_like(verdict.cost, torch.nan)
     for i in range(ORDERS):
         run = Replanned(best.fleet, forms, rows, plans, orders, known, late)
-        best.offer(rows, run.run())
-        if i == 0:
-            orders = [order[::-1] for order in orders]
-            continue
-        left = (~best.verdict.reached[rows]).nonzero().flatten()
-        if len(left) == 0:
+        now = best.offer(rows, run.run())
+        cost = torch.where(now.reached, now.cost, torch.nan)
+        left = (~((cost - before).abs() <= SAME * cost.abs())).nonzero().flatten()
+        if len(left) == 0 or late():
             return
-        orders = [run.lost[c] + [v for v in orders[c] if v not in run.lost[c]] for c in left.tolist()]
-        rows, plans, known = rows[left], plans.take(left), known[left]
+        rows, plans, known, before = rows[left], plans.take(left), known[left], cost[left]
+        if i == 0:
+            orders = [orders[c][::-1] for c in left.tolist()]
+            continue
+        drawn = [
+            best.rngs[b].permutation(orders[c]).tolist() for b, c in zip(rows.tolist(), left.tolist(), strict=True)
+        ]
+        lost = [run.lost[c] for c in left.tolist()]
+        orders = [some + [v for v in order if v not in some] for some, order in zip(lost, drawn, strict=True)]
 
 
 def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
