@@ -96,10 +96,10 @@ def test_a_negotiation_about_a_goal_inside_a_wall_ends() -> None:
 
 
 @pytest.mark.slow
-def test_a_door_of_24_is_negotiated() -> None:
-    fleet = discs("door", 24, 1, 2718)
+def test_a_door_of_16_is_negotiated() -> None:
+    fleet = discs("door", 16, 1, 2718)
     first = alone(fleet, torchgco.solve, 0, ONE, "gco")
-    order = np.random.default_rng(0).permutation(24).tolist()
+    order = np.random.default_rng(0).permutation(16).tolist()
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [order])
     teams.run()
     assert not bool(teams.meets.any()), "not within 16 turns each"

@@ -152,11 +152,12 @@ class SharedRoom:
         # What touches obstacles alone is a better guess than one that others came too close in.
         nearer = (better | (keeps & ~self.sound[rows])).nonzero().flatten()
         self.now.put(rows[nearer], new.take(nearer))
+        self.shift[rows[nearer]] = 0.0
         kept = better.nonzero().flatten()
         self.cost[rows[kept]], self.sound[rows[kept]] = cost[kept], sound[kept]
         whole = better & (self.step[rows] >= 1.0)
         self.needed[rows[whole]] += short[whole]
-        # What touches obstacles is planned again among larger ones, between the same planes.
+        # Who touches obstacles plans again among larger ones: planes as they are don't keep it from that.
         shorter = torch.where(keeps & ~clear, self.step[rows], BACK * self.step[rows])
         self.step[rows] = torch.where(better, (ON * self.step[rows]).clamp(max=1.0), shorter)
         self.live[rows] = ~small & (self.step[rows] > torch.where(self.sound[rows], BACK, SHORTEST))
@@ -204,7 +205,7 @@ class SharedRoom:
                 kept = part.solution.violation[at] <= ADMITTED
                 keeps &= kept
                 touch, grown = (-clear[at]).clamp(min=0.0), self.grown[rows, v]
-                larger = torch.maximum(grown + BEYOND * touch + MORE, ON * grown)
+                larger = torch.maximum(grown + BEYOND * touch + MORE, 2.0 * grown)
                 self.grown[rows, v] = torch.where((touch > 0) & kept, larger, grown)
                 free &= touch <= 0
         return new, cost, keeps & torch.isfinite(cost), free
