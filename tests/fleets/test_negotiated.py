@@ -55,8 +55,8 @@ def test_ways_are_negotiated_until_nobody_meets_another_one() -> None:
         assert bool(teams.meets.any()) and float(teams.cost[0]) == math.inf
         plans = teams.run()
         assert not bool(teams.meets.any()) and teams.left[0] > 0
-        own = sum(one.cost.total(x, u) for one, x, u in zip(fleet.members, plans.X, plans.U, strict=True))
-        assert torch.equal(teams.cost, own)
+        each = zip(fleet.members, plans.X, plans.U, strict=True)
+        assert torch.equal(teams.cost, torch.stack([one.cost.total(x, u) for one, x, u in each]).sum(0))
         p = fleet.places(plans.X)[0]
         assert float((p[0] - p[1]).norm(dim=-1).min()) > 0.95 * 0.4
         best, forms = solve._Best(fleet, first, 0, ONE), forms_of(fleet)

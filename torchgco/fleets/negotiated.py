@@ -118,7 +118,7 @@ class Negotiated:
         assert ground is not None
         if ways.points:
             self.ways[c][v] = ways
-            times = self.fleet.dt * np.arange(self.fleet.N + 1)
+            times = self.fleet.dt * np.arange(self.fleet.N + 1.0)
             self.p[c, v] = torch.from_numpy(smooth(ways.points[0], ways.tau, times, ground.velocity)[0])
         self.meets[c, v] = self.meets[c, :, v] = meets = self._met_by(c, v)
         self.dearer[c, v, meets] = (DEARER * self.dearer[c, v, meets]).clamp(max=DEAREST)
