@@ -9,7 +9,7 @@ from tests.fleets.scenes import disc, swaps
 from torchgco import Fleet, InteriorPoint, Spheres
 from torchgco.fleets.among import Among
 from torchgco.fleets.plans import Plans
-from torchgco.fleets.prioritised import Prioritised
+from torchgco.fleets.replanned import Replanned
 from torchgco.fleets.solve import _Best, _relieve, alone
 from torchgco.fleets.verdict import judge_fleet
 from torchgco.problem.known import Known
@@ -20,7 +20,7 @@ def test_one_of_two_that_collide_plans_again_and_the_other_stays() -> None:
     first = alone(fleet, torchgco.solve, 0, one, "gco")
     assert not bool(judge_fleet(fleet, first.U).feasible[0])
     forms = [Among(problem, Known()) for problem, _ in fleet.forms]
-    plans = Prioritised(fleet, forms, one, first, [[1]], now=first).run()
+    plans = Replanned(fleet, forms, one, first, [[1]], torch.ones(1, 2, dtype=torch.bool)).run()
     assert bool(judge_fleet(fleet, plans.U).reached[0])
     assert torch.equal(plans.U[0], first.U[0]) and not torch.equal(plans.U[1], first.U[1])
 
@@ -36,7 +36,7 @@ def test_who_pays_more_than_all_others_plans_again() -> None:
     status = torch.zeros(2, 3, dtype=torch.int64)
     plans = Plans([s.X for s in found], [s.U for s in found], [s.K for s in found], status, status.clone())
     plans.set(2, torch.tensor([1]), detour, torch.tensor([1]))
-    best = _Best(fleet, alone(fleet, torchgco.solve, 0, both, "gco"))
+    best = _Best(fleet, alone(fleet, torchgco.solve, 0, both, "gco"), 0, both)
     best.offer(both, plans)
     assert bool(best.verdict.reached.all())
     before = best.verdict.cost.clone()

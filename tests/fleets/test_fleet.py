@@ -19,7 +19,7 @@ from torchgco.fleets.among import Among
 from torchgco.fleets.fleet import _forms
 from torchgco.fleets.guesses import bent, in_conflict, widths
 from torchgco.fleets.plans import Plans
-from torchgco.fleets.prioritised import Prioritised
+from torchgco.fleets.replanned import Replanned
 from torchgco.fleets.solve import alone
 from torchgco.fleets.verdict import judge_fleet
 from torchgco.problem.known import Known
@@ -97,17 +97,17 @@ def test_prioritised_planning_alone() -> None:
     fleet, both = Fleet(swaps(5, 2), apart=0.4), torch.arange(2)
     first = alone(fleet, torchgco.solve, 0, both, "gco")
     assert not bool(judge_fleet(fleet, first.U).feasible.any())
-    orders = [[4, 2, 0, 1, 3], [0, 1, 2, 3, 4]]
-    plans = Prioritised(fleet, forms_of(fleet), both, first, orders).run()
+    orders, none = [[4, 2, 0, 1, 3], [0, 1, 2, 3, 4]], torch.zeros(2, 5, dtype=torch.bool)
+    plans = Replanned(fleet, forms_of(fleet), both, first, orders, none).run()
     verdict = judge_fleet(fleet, plans.U)
     assert bool(verdict.reached.all())
     for b in range(2):
         ways = [Bare(u[[b]]) for u in plans.U]
         assert nearest(fleet.take([b]), ways) >= 0.95 * 0.4 - 1e-3
     second = torch.tensor([1])
-    again = Prioritised(fleet, forms_of(fleet), second, first.take(second), orders[1:]).run()
+    again = Replanned(fleet, forms_of(fleet), second, first.take(second), orders[1:], none[1:]).run()
     assert all(torch.equal(mine[0], yours[1]) for mine, yours in zip(again.U, plans.U, strict=True))
-    late = Prioritised(fleet, forms_of(fleet), both, first, orders, lambda: True).run()
+    late = Replanned(fleet, forms_of(fleet), both, first, orders, none, lambda: True).run()
     assert all(torch.equal(mine, yours) for mine, yours in zip(late.U, first.U, strict=True))
 
 

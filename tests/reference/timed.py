@@ -27,6 +27,7 @@ class Ways:
     move_cost: dict[Place, float]
     last_cost: dict[Place, float]
     change: Place | tuple[float, ...]
+    toll: Array  # (layers * parts + 1, *counts), of being there at a part
 
     @property
     def layers(self) -> int:
@@ -36,14 +37,14 @@ class Ways:
     def moves(self) -> list[Place]:
         return list(itertools.product(*(range(a, b + 1) for a, b in zip(self.least, self.most, strict=True))))
 
-    def between(self, row: int, point: Array) -> float:
-        """The clearance at a point between cells, multilinear."""
+    def between(self, values: Array, row: int, point: Array) -> float:
+        """What is at a point between cells, multilinear."""
         low = np.minimum(np.floor(point).astype(int), np.array(self.counts) - 1)
         share, total = point - low, 0.0
         for corner in itertools.product((0, 1), repeat=len(self.counts)):
             weight = np.prod([s if c else 1 - s for s, c in zip(share, corner, strict=True)])
             if weight > 0:
-                total += weight * self.clearance[(row, *(low + corner))]
+                total += weight * values[(row, *(low + corner))]
         return total
 
     def leads(self, layer: int, cell: Place, move: Place) -> Place | None:
@@ -53,10 +54,17 @@ class Ways:
             return None
         for s in range(1, self.parts + 1):
             point = np.array(cell) + s / self.parts * np.array(move)
-            if self.between(layer * self.parts + s, point) < self.margin:
+            if self.between(self.clearance, layer * self.parts + s, point) < self.margin:
                 return None
         is_last = layer + 1 == self.layers
         return to if is_last or np.isfinite(self.cell_cost[(layer + 1, *to)]) else None
+
+    def paid(self, layer: int, cell: Place, move: Place) -> float:
+        """What a move and its way cost."""
+        points = (np.array(cell) + s / self.parts * np.array(move) for s in range(1, self.parts + 1))
+        return self.move_cost[move] + sum(
+            self.between(self.toll, layer * self.parts + s, point) for s, point in enumerate(points, 1)
+        )
 
     def ending(self, layer: int, cell: Place, move: Place) -> float:
         """What it costs to end there after a move."""
@@ -74,10 +82,10 @@ class Ways:
             new: dict[tuple[Place, Place], float] = {}
             for (cell, before), cost in there[-1].items():
                 for move in self.moves:
-                    more = self.changed(before, move) + self.move_cost[move]
-                    to = self.leads(layer, cell, move) if np.isfinite(more) else None
+                    more = self.changed(before, move)
+                    to = self.leads(layer, cell, move) if np.isfinite(more + self.move_cost[move]) else None
                     if to is not None:
-                        total = cost + more + self.cell_cost[(layer, *cell)]
+                        total = cost + more + self.paid(layer, cell, move) + self.cell_cost[(layer, *cell)]
                         new[to, move] = min(new.get((to, move), np.inf), total)
             there.append(new)
         onward: list[dict[tuple[Place, Place], float]] = [
@@ -88,10 +96,12 @@ class Ways:
             for cell, before in there[layer]:
                 new[cell, before] = self.ending(layer, cell, before)
                 for move in self.moves:
-                    more = self.changed(before, move) + self.move_cost[move]
-                    to = self.leads(layer, cell, move) if np.isfinite(more) else None
+                    more = self.changed(before, move)
+                    to = self.leads(layer, cell, move) if np.isfinite(more + self.move_cost[move]) else None
                     if to is not None and (to, move) in onward[0]:
-                        total = more + self.cell_cost[(layer, *cell)] + onward[0][to, move]
+                        total = (
+                            more + self.paid(layer, cell, move) + self.cell_cost[(layer, *cell)] + onward[0][to, move]
+                        )
                         new[cell, before] = min(new[cell, before], total)
             onward.insert(0, new)
         found = np.full((self.layers + 1, *self.counts), np.inf)

@@ -20,7 +20,17 @@ from torchgco import (
     Spheres,
 )
 from torchgco.native.engine import run
-from torchgco.roadmap.timed import FAR, PARTS, Surroundings, TimedLattice, TimedScene, field_of, library_for, timed_ways
+from torchgco.roadmap.timed import (
+    FAR,
+    PARTS,
+    Others,
+    Surroundings,
+    TimedLattice,
+    TimedScene,
+    field_of,
+    library_for,
+    timed_ways,
+)
 
 SPACING, TAU, MARGIN = 0.5, 0.5, 0.05
 
@@ -64,6 +74,18 @@ def drawn(counts: tuple[int, ...], layers: int, seed: int, ends: int = 1) -> Tim
     return scene_of(lattice, (gap, cost, end, move, last, change), 0, first, MARGIN)
 
 
+def tolls(scene: TimedScene) -> np.ndarray:
+    """What being at each cell at each part costs."""
+    paid = np.zeros(scene.field.away.shape)
+    if scene.others is not None:
+        for center, reach, price in zip(
+            scene.others.center.transpose(0, 1), scene.others.reach, scene.others.price, strict=True
+        ):
+            away = np.linalg.norm(scene.lattice.points - center.numpy()[:, None], axis=-1)
+            paid += float(price) / PARTS * np.maximum(0.0, 1.0 - away / float(reach))
+    return paid
+
+
 def reference(scene: TimedScene) -> np.ndarray:
     a = scene.lattice
     counts, least, most = (tuple(int(n) for n in part) for part in (a.counts, a.least, a.most))
@@ -71,7 +93,7 @@ def reference(scene: TimedScene) -> np.ndarray:
     cost, end = (np.where(part < FAR, part, np.inf) for part in parts)
     ways = Ways(
         counts, least, most, PARTS, MARGIN, scene.field.away.numpy().astype(float).reshape(-1, *counts),
-        cost, end, {}, {}, tuple(scene.change[: a.d].tolist()),
+        cost, end, {}, {}, tuple(scene.change[: a.d].tolist()), tolls(scene).reshape(-1, *counts),
     )  # fmt: skip
     finite = lambda v: float(v) if v < FAR else np.inf
     ways.move_cost = dict(zip(ways.moves, map(finite, scene.move_cost.tolist()), strict=True))
@@ -96,6 +118,20 @@ def test_costs_through_all_states_are_those_of_plain_dynamic_programming(counts,
     assert some.any() and (~some).any()
     assert np.array_equal(got.numpy() < FAR, some) and np.allclose(got.numpy()[some], due[some], atol=1e-4)
     assert one.found >= 1
+
+
+def test_the_cheapest_way_among_others_that_may_be_met_at_a_price() -> None:
+    """As plain dynamic programming with tolls; others go the way that is the cheapest without them."""
+    scene = drawn((6, 5), 6, 0)
+    (free,) = timed_ways([scene], 1, 0.0)
+    assert float(free.costs[0]) == pytest.approx(reference(scene).min(), abs=1e-4)
+    times = np.arange(6 * PARTS + 1) / PARTS
+    way = np.stack([np.interp(times, np.arange(len(free.points[0])), x) for x in free.points[0].T], axis=-1)
+    center = torch.from_numpy(np.stack((way, way + 0.7 * SPACING), axis=1))
+    met = replace(scene, others=Others(center, torch.tensor([0.4, 0.6]), torch.tensor([0.3, 0.5])))
+    (found,) = timed_ways([met], 1, 0.0)
+    assert len(found.points) == 1 and float(found.costs[0]) > float(free.costs[0]) + 0.01
+    assert float(found.costs[0]) == pytest.approx(reference(met).min(), abs=1e-4)
 
 
 def wall(opens: tuple[float, float], closes: float = np.inf) -> TimedScene:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
+from torchgco.fleets.fleet import Fleet
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
-from torchgco.roadmap.timed import TimedScene
-from torchgco.search.timed_scenes import among, scene_in_time
+from torchgco.roadmap.lattice import Array
+from torchgco.roadmap.timed import FAR, PARTS, Others, TimedScene, library_for
+from torchgco.search.timed_scenes import Velocity, among, can_search, scene_in_time
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.interior import InteriorPoint
@@ -29,6 +32,46 @@ class Plain(InteriorPoint, named="solver"):
 # From near guesses: a large barrier would lose them.
 SOLVER = Plain(tolerance=1e-6, initial_barrier=1e-2, max_iterations=100)
 
+# A way on a lattice changes its velocity by a unit in a layer, so a smooth one leaves it by up to an eighth of a cell.
+BESIDE = 0.25  # cells by which two smooth ways may be closer than those on their lattices
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The lattice of a vehicle.
+
+    Args:
+        scene: without others.
+        velocity: at the start, (d,), m/s.
+        most: that being anywhere for a layer, and any move, may cost.
+    """
+
+    scene: TimedScene
+    velocity: Array
+    most: float
+
+    @classmethod
+    def of(cls, problem: Problem, with_others: Problem, free: Tensor) -> Ground | None:
+        """That of a batch of one; None where there is no library, or what is in its way has no distances."""
+        d = problem.position.stop - problem.position.start
+        if not can_search(with_others) or library_for(d) is None:
+            return None
+        scene = among(scene_in_time(with_others, free), problem)
+        most = 0.0
+        for cost in (scene.cell_cost, scene.move_cost):
+            some = cost[cost < FAR]
+            most += float(some.amax() - some.amin())
+        return cls(scene, Velocity.of(problem).start, most if most > 0.0 else 1.0)
+
+    def among(self, others: Tensor, radii: Tensor, price: Tensor, dt: float) -> TimedScene:
+        """The lattice among others at (M, N+1, d), dt apart, from which ways should keep `radii` (M,), m."""
+        lattice, last = self.scene.lattice, others.shape[1] - 1
+        k = torch.arange(lattice.layers * PARTS + 1, dtype=others.dtype) * (lattice.tau / (PARTS * dt))
+        before = k.long().clamp(max=last - 1)
+        share = (k - before).clamp(max=1.0).view(1, -1, 1)
+        center = torch.lerp(others[:, before], others[:, before + 1], share).transpose(0, 1)
+        return replace(self.scene, others=Others(center, radii + BESIDE * lattice.spacing, price))
+
 
 @dataclass(frozen=True)
 class Among:
@@ -36,7 +79,7 @@ class Among:
 
     problem: Problem
     known: Known
-    scenes: dict[int, TimedScene] = field(default_factory=dict)  # lattices of problems at some rows
+    grounds: dict[int, Ground | None] = field(default_factory=dict)  # of problems at some rows
 
     def at(
         self,
@@ -61,16 +104,21 @@ class Among:
         goals = [part for part in one.constraints if part.is_goal]
         return one._with({"constraints": (*parts, others, *goals)}, known=self.known)
 
-    def scene(self, row: int, problem: Problem, free: Tensor) -> TimedScene:
-        """The lattice of the problem at a row with what is in its way now.
+    def ground(self, fleet: Fleet, v: int, b: int, free: Tensor) -> Ground | None:
+        """The lattice of vehicle v of fleet b, without the others; None where none can be searched.
 
         Args:
-            problem: a batch of one.
-            free: states (N+1, n) of it alone.
+            free: states (N+1, n) of it, which say how fast it is.
         """
-        if row in self.scenes:
-            return among(self.scenes[row], problem)
-        return self.scenes.setdefault(row, scene_in_time(problem, free))
+        row = fleet.row_of(v, b)
+        if row not in self.grounds:
+            at, keep = torch.tensor([row]), fleet.distances[v]
+            radii = keep[keep > 0].unsqueeze(0)
+            # How large the others are counts, and not where they are: a lattice is as fine as half of what is kept.
+            places = free[None, :, None, self.problem.position].repeat(1, 1, radii.shape[1], 1)
+            with_others = self.at(at, places, radii, own=0.5 * radii.amin(-1))
+            self.grounds[row] = Ground.of(self.problem.take(at), with_others, free)
+        return self.grounds[row]
 
     @property
     def place(self) -> int:

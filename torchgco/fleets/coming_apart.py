@@ -128,6 +128,7 @@ class ComingApart:
             past = self.history[c]
             past.append(last.lacks)
             self.live[c] = len(past) <= PATIENCE or past[-1] <= LEFT * past[-1 - PATIENCE]
+            self.live[c] &= self.radius[c] >= CLOSE * needed.amax()  # smaller steps bring nobody apart
             share = min(1.0, float(self.radius[c] / last.moved.norm(dim=-1).amax()))
             self.target[c] = last.p + share * last.moved
             self.force[c] = last.force + share * (last.balance - last.force)

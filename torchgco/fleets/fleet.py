@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import combinations
 from typing import Any
 
@@ -100,6 +101,15 @@ class Fleet:
     def places(self, X: Sequence[Tensor]) -> Tensor:
         """Positions (B, V, K, d) of the vehicles in states (B, K, n) each."""
         return torch.stack([x[..., one.position] for one, x in zip(self.members, X, strict=True)], dim=1)
+
+    @cached_property
+    def form_of(self) -> dict[int, tuple[int, int]]:
+        """Of each vehicle its form, and its place there."""
+        return {v: (i, place) for i, (_, whose) in enumerate(self.forms) for place, v in enumerate(whose)}
+
+    def row_of(self, v: int, b: int) -> int:
+        """Which problem of its form vehicle v of fleet b has."""
+        return self.form_of[v][1] * self.B + b
 
     def take(self, b: Sequence[int]) -> Fleet:
         """The fleets at some places of the batch."""

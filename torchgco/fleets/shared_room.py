@@ -139,7 +139,8 @@ class SharedRoom:
         """Plan between new planes, and keep what is better."""
         room, p = self._room(rows)
         sides = [self._solved(i, rows, room, p) for i in range(len(self.forms))]
-        new, cost, fine = self._gathered(rows, sides)
+        new, cost, keeps, clear = self._gathered(rows, sides)
+        fine = keeps & clear
         short = self._short(rows, new)
         sound = fine & (short <= 0).flatten(1).all(-1)
         better = fine & ((cost < self.cost[rows]) | ~self.sound[rows])
@@ -148,12 +149,17 @@ class SharedRoom:
         self.best.put(rows[best], new.take(best))
         self.least[rows[best]] = cost[best]
         small = sound & better & self.sound[rows] & (gain < LEAST_GAIN * cost.abs())
+        # What touches obstacles alone is a better guess than one that others came too close in.
+        nearer = (better | (keeps & ~self.sound[rows])).nonzero().flatten()
+        self.now.put(rows[nearer], new.take(nearer))
+        self.shift[rows[nearer]] = 0.0
         kept = better.nonzero().flatten()
-        self.now.put(rows[kept], new.take(kept))
         self.cost[rows[kept]], self.sound[rows[kept]] = cost[kept], sound[kept]
         whole = better & (self.step[rows] >= 1.0)
         self.needed[rows[whole]] += short[whole]
-        self.step[rows] = torch.where(better, (ON * self.step[rows]).clamp(max=1.0), BACK * self.step[rows])
+        # Who touches obstacles plans again among larger ones: planes as they are don't keep it from that.
+        shorter = torch.where(keeps & ~clear, self.step[rows], BACK * self.step[rows])
+        self.step[rows] = torch.where(better, (ON * self.step[rows]).clamp(max=1.0), shorter)
         self.live[rows] = ~small & (self.step[rows] > torch.where(self.sound[rows], BACK, SHORTEST))
         again = (better & self.live[rows]).nonzero().flatten()
         if len(again):
@@ -184,10 +190,11 @@ class SharedRoom:
         solution = SOLVER.solve(problem, U, X0=X)
         return Sides(whose, among.problem.take(own), problem, among.place, centers, solution)
 
-    def _gathered(self, rows: Tensor, sides: Sequence[Sides]) -> tuple[Plans, Tensor, Tensor]:
-        """Plans, costs (c,) and whether all vehicles keep their constraints (c,)."""
+    def _gathered(self, rows: Tensor, sides: Sequence[Sides]) -> tuple[Plans, Tensor, Tensor, Tensor]:
+        """Plans, costs (c,), whether all vehicles keep their constraints (c,), and obstacles between the knots."""
         new, count = self.now.take(rows), torch.arange(len(rows))
-        cost, fine = torch.zeros_like(self.cost[rows]), torch.ones_like(self.sound[rows])
+        cost, keeps = torch.zeros_like(self.cost[rows]), torch.ones_like(self.sound[rows])
+        free = keeps.clone()
         for part in sides:
             clear = path_clearance(part.bare, part.solution.X, part.solution.U)
             for place, v in enumerate(part.whose):
@@ -195,11 +202,13 @@ class SharedRoom:
                 new.set(v, count, part.solution, at)
                 new.iterations[:, v] += part.solution.iterations[at]
                 cost += part.solution.cost[at]
-                fine &= part.solution.violation[at] <= ADMITTED
-                touch = (-clear[at]).clamp(min=0.0)
-                self.grown[rows, v] += torch.where(touch > 0, BEYOND * touch + MORE, 0.0)
-                fine &= touch <= 0
-        return new, cost, fine & torch.isfinite(cost)
+                kept = part.solution.violation[at] <= ADMITTED
+                keeps &= kept
+                touch, grown = (-clear[at]).clamp(min=0.0), self.grown[rows, v]
+                larger = torch.maximum(grown + BEYOND * touch + MORE, 2.0 * grown)
+                self.grown[rows, v] = torch.where((touch > 0) & kept, larger, grown)
+                free &= touch <= 0
+        return new, cost, keeps & torch.isfinite(cost), free
 
     def _short(self, rows: Tensor, new: Plans) -> Tensor:
         """By how much more pairs have to keep at knots (c, V, V, K), m."""

@@ -1,4 +1,4 @@
-"""From a fleet to its trajectories: each alone, all together, and one after the other where that doesn't do."""
+"""From a fleet to its trajectories: each alone, all together, and by negotiations where that doesn't do."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ from torchgco.fleets.among import Among
 from torchgco.fleets.coming_apart import ComingApart
 from torchgco.fleets.fleet import Fleet
 from torchgco.fleets.guesses import SIDES, aside
+from torchgco.fleets.negotiated import Negotiated
 from torchgco.fleets.plans import Plans, Solve
-from torchgco.fleets.prioritised import Prioritised
+from torchgco.fleets.replanned import Replanned
 from torchgco.fleets.shared_room import SharedRoom
 from torchgco.fleets.solution import FleetSolution
-from torchgco.fleets.verdict import FleetVerdict, judge_fleet
+from torchgco.fleets.verdict import FleetVerdict, judge_fleet, served
 from torchgco.problem.known import Known
 
-ORDERS = 2  # times two orders in which the vehicles of a fleet plan, at most
+DRAWN = 2  # orders of turns in which vehicles negotiate
+ORDERS = 4  # in which vehicles plan again, at most
 SAME = 0.02  # share by which the costs of two orders may differ: then others are no better
-RAISED = 2  # times as often as there are vehicles, one gets priority over all others, at most
 
 
 class _Best:
     """The best plans of every fleet so far."""
 
-    def __init__(self, fleet: Fleet, plans: Plans) -> None:
+    def __init__(self, fleet: Fleet, plans: Plans, seed: int, ids: Tensor) -> None:
+        self.rngs = [np.random.default_rng((seed, number)) for number in ids.tolist()]
         self.fleet, self.alone, self.plans = fleet, plans, plans.take(torch.arange(fleet.B))
         self.verdict = judge_fleet(fleet, plans.U)
         self.least = self.costs  # (B, V), of vehicles alone
@@ -88,36 +90,36 @@ def solve_fleet(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         first = alone(fleet, solve, seed, ids, solver)
-        best, forms = _Best(fleet, first), [Among(one, Known()) for one, _ in fleet.forms]
+        best, forms = _Best(fleet, first, seed, ids), [Among(one, Known()) for one, _ in fleet.forms]
         for side in SIDES:
-            if len(rows := best.open) > 0 and not late():
-                apart = ComingApart(fleet, forms, rows, aside(fleet, forms, rows, first.take(rows), side), late)
-                plans = apart.run()
-                near = apart.near.nonzero().flatten()
-                _improve(best, forms, rows[near], plans.take(near), late)
-        if len(rows := best.open) > 0 and not late():
-            _one_after_other(best, forms, rows, seed, ids, late)
-            rows = rows[best.verdict.reached[rows]]
-            _improve(best, forms, rows, best.plans.take(rows), late)
+            _come_apart(best, forms, side, late)
+            _negotiate(best, forms, late)
         _relieve(best, forms, late)
     return FleetSolution(fleet, best.plans.solutions(fleet, best.verdict, late()), best.verdict)
 
 
-def _one_after_other(
-    best: _Best, forms: list[Among], rows: Tensor, seed: int, ids: Tensor, late: Callable[[], bool]
-) -> None:
-    """Offer plans of prioritised planning in drawn orders, two at once: as long as orders matter, or none is sound."""
-    rngs = {b: np.random.default_rng((seed, int(ids[b]))) for b in rows.tolist()}
-    for _ in range(ORDERS):
-        if len(rows) == 0 or late():
-            return
-        of = rows.repeat_interleave(2)
-        orders = [rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
-        first, most = best.alone.take(of), RAISED * best.fleet.V
-        teams = Prioritised(best.fleet, forms, of, first, orders, late, raised=most).run()
-        pair = [best.offer(rows, teams.take(torch.arange(i, len(of), 2))) for i in range(2)]
-        same = (pair[0].cost - pair[1].cost).abs() <= SAME * pair[0].cost.abs()
-        rows = rows[~(same & pair[0].reached & pair[1].reached)]
+def _come_apart(best: _Best, forms: list[Among], side: float, late: Callable[[], bool]) -> None:
+    """Offer what becomes of fleets that aren't sound where all vehicles pass each other on a side."""
+    rows = best.open
+    if len(rows) == 0 or late():
+        return
+    guesses = aside(best.fleet, forms, rows, best.alone.take(rows), side)
+    apart = ComingApart(best.fleet, forms, rows, guesses, late)
+    plans = apart.run()
+    near = apart.near.nonzero().flatten()
+    _improve(best, forms, rows[near], plans.take(near), late)
+
+
+def _negotiate(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
+    """Offer what the vehicles of fleets that aren't sound negotiate: of drawn orders of turns the cheapest."""
+    rows = best.open
+    if len(rows) == 0 or late():
+        return
+    of = rows.repeat_interleave(DRAWN)
+    orders = [best.rngs[b].permutation(best.fleet.V).tolist() for b in of.tolist()]
+    teams = Negotiated(best.fleet, forms, of, best.alone.take(of), orders, late=late)
+    plans, least = teams.run(), teams.cost.view(-1, DRAWN).argmin(-1)
+    _improve(best, forms, rows, plans.take(DRAWN * torch.arange(len(rows)) + least), late)
 
 
 def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
@@ -134,26 +136,48 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
         if len(left) == 0 or not again:
             return
         rows, plans = rows[left], plans.take(left)
-        apart = judge_fleet(best.fleet.take(rows.tolist()), plans.U).apart
-        orders = [(~one).nonzero().flatten().tolist() for one in apart]
-        for turned in (False, True):
-            some = [order[::-1] if turned else order for order in orders]
-            best.offer(rows, Prioritised(best.fleet, forms, rows, plans, some, late, plans).run())
+        _plan_again(best, forms, rows, plans, late)
         rows = rows[best.verdict.reached[rows]]
         plans = best.plans.take(rows)
 
 
+def _plan_again(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: Callable[[], bool]) -> None:
+    """Offer what becomes of fleets, (b,), whose vehicles that aren't sound plan again one after the other.
+
+    Both ends of what is in conflict begin; after that, whoever has found no plan. It ends where order doesn't matter.
+    """
+    verdict = judge_fleet(best.fleet.take(rows.tolist()), plans.U)
+    known = served(best.fleet, verdict.vehicles)
+    orders = [(~one).nonzero().flatten().tolist() for one in known & verdict.apart]
+    before = torch.full_like(verdict.cost, torch.nan)
+    for i in range(ORDERS):
+        run = Replanned(best.fleet, forms, rows, plans, orders, known, late)
+        now = best.offer(rows, run.run())
+        cost = torch.where(now.reached, now.cost, torch.nan)
+        left = (~((cost - before).abs() <= SAME * cost.abs())).nonzero().flatten()
+        if len(left) == 0 or late():
+            return
+        rows, plans, known, before = rows[left], plans.take(left), known[left], cost[left]
+        if i == 0:
+            orders = [orders[c][::-1] for c in left.tolist()]
+            continue
+        drawn = [
+            best.rngs[b].permutation(orders[c]).tolist() for b, c in zip(rows.tolist(), left.tolist(), strict=True)
+        ]
+        lost = [run.lost[c] for c in left.tolist()]
+        orders = [some + [v for v in order if v not in some] for some, order in zip(lost, drawn, strict=True)]
+
+
 def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
-    """Where one vehicle pays more for the others than all of these together, it plans again among them."""
+    """Where one vehicle pays more for the others than all of these together, it goes another way, and who meets it."""
     paid = best.costs - best.least
     rows = (best.verdict.reached & (2.0 * paid.amax(-1) > paid.sum(-1))).nonzero().flatten()
     if len(rows) == 0 or late():
         return
-    before, orders = best.verdict.cost[rows], [[v] for v in paid[rows].argmax(-1).tolist()]
-    first, now = best.alone.take(rows), best.plans.take(rows)
-    best.offer(rows, Prioritised(best.fleet, forms, rows, first, orders, late, now).run())
-    rows = rows[best.verdict.cost[rows] < before]
-    _improve(best, forms, rows, best.plans.take(rows), late)
+    due = [[v] for v in paid[rows].argmax(-1).tolist()]
+    orders = [list(range(best.fleet.V))] * len(rows)
+    plans = Negotiated(best.fleet, forms, rows, best.plans.take(rows), orders, due, late).run()
+    _improve(best, forms, rows, plans, late)
 
 
 def _late(ends: float | None) -> bool:

@@ -59,12 +59,17 @@ def judge_fleet(fleet: Fleet, U: Sequence[Tensor]) -> FleetVerdict:
     violation = torch.stack([v.violation for v in verdicts]).amax(0).maximum(short)
     own = torch.stack([v.clearance for v in verdicts]).amin(0)
     feasible = torch.stack([v.feasible for v in verdicts]).all(0) & ~touches.any(-1)
-    arrived = [v.reached | (not states_goal(one)) for v, one in zip(verdicts, fleet.members, strict=True)]
-    cost, reached = torch.stack([v.cost for v in verdicts]).sum(0), feasible & torch.stack(arrived).all(0)
+    cost, reached = torch.stack([v.cost for v in verdicts]).sum(0), feasible & served(fleet, verdicts).all(-1)
     return FleetVerdict(
         tuple(verdicts), cost, least.amin(-1), close == 0, violation, torch.minimum(own, touch), feasible, reached,
         makespan(fleet, X),
     )  # fmt: skip
+
+
+def served(fleet: Fleet, verdicts: Sequence[Verdict]) -> Tensor:
+    """Which vehicles are feasible among their own obstacles, and at the goals that they state, (B, V) bool."""
+    each = zip(verdicts, fleet.members, strict=True)
+    return torch.stack([v.feasible & (v.reached | (not states_goal(one))) for v, one in each], dim=1)
 
 
 def states_goal(one: Problem) -> bool:

@@ -116,6 +116,20 @@ class Surroundings:
 
 
 @dataclass(frozen=True, eq=False)
+class Others:
+    """Balls that a way may meet at a price: of each `price` for a layer all the way inside, less where less deep.
+
+    Args:
+        center: of M balls at `PARTS` times a layer, (layers PARTS + 1, M, d), m.
+        reach, price: (M,); m.
+    """
+
+    center: Tensor
+    reach: Tensor
+    price: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class TimedScene:
     """What a lattice is searched for.
 
@@ -140,6 +154,7 @@ class TimedScene:
     start: int
     first: int
     margin: float
+    others: Others | None = None
 
     def arguments(self, most: int, dearer: float) -> Timed:
         """What C reads and writes of up to `most` ways."""
@@ -152,11 +167,19 @@ class TimedScene:
             counts=counts, least=least, moves=moves, layers=a.layers, parts=PARTS, start=self.start, first=self.first,
             earliest=a.layers + 1 - len(self.end_cost), spacing=a.spacing, margin=self.margin, dearer=dearer,
             solids=len(field.radius), resting=field.resting, center=field.center, half=field.half, axes=field.axes,
-            radius=field.radius, clearance=field.away.clone(), cell_cost=self.cell_cost, end_cost=self.end_cost,
-            move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most, tries=TRIES, found=0,
+            radius=field.radius, **self._met(), clearance=field.away.clone(), cell_cost=self.cell_cost,
+            end_cost=self.end_cost, move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most,
+            tries=TRIES, found=0,
             way=torch.empty(most, a.layers + 1, dtype=torch.int32), end=torch.empty(most, dtype=torch.int32),
             cost=torch.empty(most, dtype=torch.float32),
         )  # fmt: skip
+
+    def _met(self) -> dict[str, Any]:
+        if self.others is None:
+            return {"others": 0, "other": None, "reach": None, "price": None}
+        center = self.others.center - torch.from_numpy(self.lattice.origin)
+        other, reach, price = (part.float().contiguous() for part in (center, self.others.reach, self.others.price))
+        return {"others": len(reach), "other": other, "reach": reach, "price": price}
 
 
 @dataclass(frozen=True, eq=False)

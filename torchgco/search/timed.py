@@ -70,7 +70,7 @@ def _states(problem: Problem, found: list[TimedWays], times: list[Array]) -> Ten
             continue
         velocity = Velocity.of(problem.take(torch.tensor([b], device=problem.x0.device)))
         for points in ways.points:
-            p, v = _smooth(points, ways.tau, next(t), velocity.start)
+            p, v = smooth(points, ways.tau, next(t), velocity.start)
             x = velocity.states(v, problem.x0.new_tensor(p))
             x[0] = problem.x0[b]
             states.append(x.unsqueeze(0))
@@ -89,7 +89,7 @@ def _controls(many: Problem, X: Tensor, U: Tensor) -> Tensor:
     return torch.minimum(torch.maximum(U, lower), upper)
 
 
-def _smooth(points: Array, tau: float, t: Array, first: Array) -> tuple[Array, Array]:
+def smooth(points: Array, tau: float, t: Array, first: Array) -> tuple[Array, Array]:
     """Places and velocities (K, d) at times (K,) of the cubic spline through points (P, d) at times tau apart; at rest
     after the last one.
 

@@ -7,134 +7,11 @@
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
-#include "timed.h"
+#include "timed_field.h"
 
-#define CORNERS (1 << DIM)
+#define EXCESS 0.05f /* share by which the cheapest way may cost more than what lies ahead says, at first */
+#define DOUBLINGS 8 /* of it; then any way is looked for */
 #define BESIDE (DIM == 3 ? 27 : 9) /* moves that one may follow */
-#define ROWS(x) for (int64_t r = 0; r < (x)->rows; r++)
-
-/* Where a move is at a part of it, between cells: how far these lie from the cell that it leaves, and their shares. */
-typedef struct { int64_t offset[CORNERS]; float share[CORNERS]; int64_t count; } Between;
-
-typedef struct {
-    const Timed *t;
-    int64_t cells, moves, rows, width, last; /* width: cells of a row; last: moves along it */
-    int64_t step[DIM], turn[DIM]; /* strides of cells and of moves */
-    int32_t *move; /* (moves, DIM) */
-    Between *between; /* (moves, parts - 1) */
-    float *ahead; /* (layers + 1, cells): no more than what any way costs from there on, without the changes of moves */
-    float *least; /* (layers + 1, cells): of the cheapest way there */
-    float *there, *onward; /* (layers + 1, moves, cells): the cheapest way to each state, and from it to the end */
-    int32_t *from, *to; /* (layers + 1, rows): between these cells of a row any way leads there */
-    float *row, *wide, *gap; /* (moves, width), (moves, width), (width): scratch */
-    float limit; /* what a way may cost */
-} Sweep;
-
-static inline float lower(float a, float b) { return a < b ? a : b; }
-
-/* The clearance at a layer's part and at a point between cells, in cells. */
-static float clearance_at(const Sweep *w, int64_t part, const float *at) {
-    const float *field = w->t->clearance + part * w->cells;
-    int64_t base = 0, step[DIM];
-    float share[DIM], sum = 0.0f;
-    for (int a = 0; a < DIM; a++) {
-        int64_t last = w->t->counts[a] - 1, i = (int64_t)at[a];
-        i = i < 0 ? 0 : i > last ? last : i;
-        share[a] = i < last ? at[a] - (float)i : 0.0f;
-        step[a] = i < last ? w->step[a] : 0;
-        base += i * w->step[a];
-    }
-    for (int corner = 0; corner < CORNERS; corner++) {
-        float weight = 1.0f;
-        int64_t place = base;
-        for (int a = 0; a < DIM; a++) {
-            int up = corner >> a & 1;
-            weight *= up ? share[a] : 1.0f - share[a];
-            place += up ? step[a] : 0;
-        }
-        if (weight > 0.0f) sum += weight * field[place];
-    }
-    return sum;
-}
-
-static void cell_of(const Sweep *w, int64_t cell, int64_t *at) {
-    for (int a = 0; a < DIM; a++) at[a] = cell / w->step[a] % w->t->counts[a];
-}
-
-/* Where a move leads from a cell at `at`; -1: out of the lattice. */
-static int64_t moved(const Sweep *w, const int64_t *at, int64_t cell, const int32_t *d) {
-    for (int a = 0; a < DIM; a++) {
-        if ((uint64_t)(at[a] + d[a]) >= (uint64_t)w->t->counts[a]) return -1;
-        cell += d[a] * w->step[a];
-    }
-    return cell;
-}
-
-/* Lower the distances of a row of cells to those from one solid; `v` leads there from its centre, at the first cell. */
-static void lowered(const Timed *t, int64_t i, float *row, int64_t count, const float *v) {
-    const float *half = t->half + i * DIM, *axes = t->axes + i * DIM * DIM;
-    float radius = t->radius[i], h = (float)t->spacing, begin[DIM], along[DIM], square = 0.0f, size = 0.0f;
-    for (int k = 0; k < DIM; k++) {
-        begin[k] = 0.0f, along[k] = h * axes[k * DIM + DIM - 1], size += half[k];
-        for (int a = 0; a < DIM; a++) begin[k] += axes[k * DIM + a] * v[a];
-        if (k < DIM - 1) square += v[k] * v[k];
-    }
-    if (size == 0.0f) {
-        for (int64_t j = 0; j < count; j++) {
-            float x = v[DIM - 1] + h * (float)j, away = sqrtf(square + x * x) - radius;
-            row[j] = away < row[j] ? away : row[j];
-        }
-        return;
-    }
-    for (int64_t j = 0; j < count; j++) {
-        float deepest = -FAR, sum = 0.0f;
-        for (int k = 0; k < DIM; k++) {
-            float q = fabsf(begin[k] + along[k] * (float)j) - half[k], out = q > 0.0f ? q : 0.0f;
-            deepest = q > deepest ? q : deepest, sum += out * out;
-        }
-        float away = (deepest > 0.0f ? sqrtf(sum) : deepest) - radius;
-        row[j] = away < row[j] ? away : row[j];
-    }
-}
-
-/* Lower the distances of all cells nearer than `far` to a solid at one time. */
-static void lower_around(const Sweep *w, int64_t i, const float *center, float far, float *field) {
-    const Timed *t = w->t;
-    int64_t low[DIM], high[DIM];
-    for (int a = 0; a < DIM; a++) {
-        double reach = far + t->radius[i];
-        for (int k = 0; k < DIM; k++) reach += fabsf(t->axes[(i * DIM + k) * DIM + a]) * t->half[i * DIM + k];
-        double first = ceil((center[a] - reach) / t->spacing), last = floor((center[a] + reach) / t->spacing);
-        if (!(first < (double)t->counts[a]) || !(last >= 0.0)) return;
-        low[a] = first > 0.0 ? (int64_t)first : 0;
-        high[a] = last < (double)t->counts[a] - 1.0 ? (int64_t)last : t->counts[a] - 1;
-    }
-    int64_t at[DIM];
-    memcpy(at, low, sizeof at);
-    for (;;) {
-        float v[DIM];
-        int64_t cell = 0;
-        for (int a = 0; a < DIM; a++) cell += at[a] * w->step[a], v[a] = (float)at[a] * (float)t->spacing - center[a];
-        lowered(t, i, field + cell, high[DIM - 1] - low[DIM - 1] + 1, v);
-        int a = DIM - 2;
-        for (; a >= 0 && ++at[a] > high[a]; a--) at[a] = low[a];
-        if (a < 0) return;
-    }
-}
-
-/* The clearance from the solids, too, no more than what matters: beyond it all cells beside are clear. */
-static void measure(const Sweep *w, float *rest) {
-    const Timed *t = w->t;
-    float far = (float)(t->margin + t->spacing * sqrt(DIM));
-    for (int64_t c = 0; c < w->cells; c++) rest[c] = far;
-    for (int64_t i = 0; i < t->resting; i++) lower_around(w, i, t->center + i * DIM, far, rest);
-    for (int64_t k = 0; k <= t->layers * t->parts; k++) {
-        float *field = t->clearance + k * w->cells;
-        for (int64_t c = 0; c < w->cells; c++) field[c] = lower(field[c], rest[c]);
-        for (int64_t i = t->resting; i < t->solids; i++)
-            lower_around(w, i, t->center + (k * t->solids + i) * DIM, far, field);
-    }
-}
 
 /* Of each move the cells beside its parts. */
 static void look_between(Sweep *w) {
@@ -180,22 +57,41 @@ static inline float end_of(const Sweep *w, int64_t l, int64_t c) {
     return l < w->t->earliest ? FAR : w->t->end_cost[(l - w->t->earliest) * w->cells + c];
 }
 
-/* The least of `row` (cells) within the moves along an axis. */
+/* Of what moves cost the share of each axis: at least what the units along it make of it. */
+static void divide(const Sweep *w) {
+    const Timed *t = w->t;
+    float *left = w->row;
+    for (int64_t m = 0; m < w->moves; m++) left[m] = t->move_cost[m];
+    for (int a = 0; a < DIM; a++) {
+        float *own = w->along + a * w->moves;
+        for (int64_t k = 0; k < t->moves[a]; k++) own[k] = FAR;
+        for (int64_t m = 0; m < w->moves; m++) {
+            float *least = own + m / w->turn[a] % t->moves[a];
+            *least = lower(*least, left[m]);
+        }
+        for (int64_t m = 0; m < w->moves; m++)
+            left[m] = left[m] >= FAR ? FAR : left[m] - own[m / w->turn[a] % t->moves[a]];
+    }
+}
+
+/* The least of `row` (cells) within the moves along an axis, with what these cost at least. */
 static void reached(const Sweep *w, int a, const float *row, float *to) {
     int64_t n = w->t->counts[a], step = w->step[a], low = w->t->least[a], high = low + w->t->moves[a] - 1;
     for (int64_t c = 0; c < w->cells; c++) to[c] = FAR;
     for (int64_t o = 0; o < w->cells; o += n * step)
         for (int64_t k = low; k <= high; k++) {
             int64_t first = k < 0 ? -k : 0, end = k > 0 ? n - k : n;
-            for (int64_t j = first * step; j < end * step; j++) to[o + j] = lower(to[o + j], row[o + j + k * step]);
+            float cost = w->along[a * w->moves + k - low];
+            for (int64_t j = o + first * step; j < o + end * step; j++) to[j] = lower(to[j], row[j + k * step] + cost);
         }
 }
 
 /* What any way costs at least from each layer and cell on, by cells and moves alone; FAR where nobody may be. */
 static void look_ahead(const Sweep *w, float *scratch) {
     const Timed *t = w->t;
-    float least = FAR, last = FAR, margin = (float)t->margin;
-    for (int64_t m = 0; m < w->moves; m++) least = lower(t->move_cost[m], least), last = lower(t->last_cost[m], last);
+    float last = FAR, margin = (float)t->margin;
+    for (int64_t m = 0; m < w->moves; m++) last = lower(t->last_cost[m], last);
+    divide(w);
     for (int64_t l = t->layers; l >= 0; l--) {
         const float *gap = t->clearance + l * t->parts * w->cells, *cost = t->cell_cost + l * w->cells;
         float *own = w->ahead + l * w->cells, *from = own + w->cells, *to = scratch;
@@ -205,11 +101,12 @@ static void look_ahead(const Sweep *w, float *scratch) {
                 reached(w, a, from, to);
                 from = to, to = a % 2 ? scratch : scratch + w->cells;
             }
-            for (int64_t c = 0; c < w->cells; c++) own[c] = lower(from[c] + cost[c] + least, FAR);
+            for (int64_t c = 0; c < w->cells; c++) own[c] = lower(from[c] + cost[c], FAR);
         }
         for (int64_t c = 0; c < w->cells; c++) {
             int barred = (l > 0 && gap[c] < margin) || (l < t->layers && cost[c] >= FAR); /* a start may be near */
             own[c] = barred ? FAR : lower(own[c], end_of(w, l, c) + last);
+            if (w->toll && l > 0 && own[c] < FAR) own[c] += w->toll[l * t->parts * w->cells + c];
         }
     }
 }
@@ -251,8 +148,8 @@ static void trim(const Sweep *w, int64_t l, int is_known) {
 /* The least clearance of a move on its way from cells `begin` to `end` of a row at a layer, into w->gap. */
 static void pass(const Sweep *w, int64_t l, int64_t m, int64_t begin, int64_t end) {
     const Timed *t = w->t;
-    float *gap = w->gap, *sum = w->gap + w->width;
-    for (int64_t j = 0; j < end - begin; j++) gap[j] = FAR;
+    float *gap = w->gap, *sum = w->gap + w->width, *paid = w->paid;
+    for (int64_t j = 0; j < end - begin; j++) gap[j] = FAR, paid[j] = 0.0f;
     for (int64_t s = 1; s < t->parts; s++) {
         const Between *b = w->between + m * (t->parts - 1) + s - 1;
         const float *field = t->clearance + (l * t->parts + s) * w->cells + begin;
@@ -263,6 +160,11 @@ static void pass(const Sweep *w, int64_t l, int64_t m, int64_t begin, int64_t en
             for (int64_t j = 0; j < end - begin; j++) sum[j] += share * beside[j];
         }
         for (int64_t j = 0; j < end - begin; j++) gap[j] = lower(gap[j], sum[j]);
+        for (int64_t i = 0; w->toll && i < b->count; i++) {
+            const float *beside = w->toll + (l * t->parts + s) * w->cells + begin + b->offset[i];
+            float share = b->share[i];
+            for (int64_t j = 0; j < end - begin; j++) paid[j] += share * beside[j];
+        }
     }
 }
 
@@ -299,18 +201,22 @@ static void lead(const Sweep *w, int64_t l, int64_t r) {
         for (int64_t j = begin; j < end; j++) best = lower(best, so_far[j]);
         if (best >= FAR) continue;
         pass(w, l, m, r * w->width + begin, r * w->width + end);
-        const float *gap = w->gap, *ahead = w->ahead + (l + 1) * w->cells + cell;
+        const float *gap = w->gap, *paid = w->paid - begin, *ahead = w->ahead + (l + 1) * w->cells + cell;
+        const float *toll = w->toll ? w->toll + (l + 1) * t->parts * w->cells + cell : NULL;
+        if (toll)
+            for (int64_t j = begin; j < end; j++) w->paid[j - begin] += toll[j];
         float *to = w->there + ((l + 1) * M + m) * w->cells + cell, *least = w->least + (l + 1) * w->cells + cell;
         for (int64_t j = begin; j < end; j++) {
-            float v = so_far[j] + stay[j] + t->move_cost[m];
+            float v = so_far[j] + stay[j] + t->move_cost[m] + paid[j];
             v = gap[j - begin] < margin || ahead[j] >= FAR || v >= FAR ? FAR : v;
             to[j] = v, least[j] = lower(least[j], v);
         }
     }
 }
 
-/* The cheapest ways to all states; returns what the cheapest to the end costs. */
-static float sweep_there(Sweep *w) {
+/* The cheapest ways to all states that one of no more than `limit` may lead through; returns what the cheapest to the
+   end costs. */
+static float sweep_there(Sweep *w, float limit) {
     const Timed *t = w->t;
     int64_t M = w->moves, C = w->cells;
     float best = FAR;
@@ -324,8 +230,10 @@ static float sweep_there(Sweep *w) {
         trim(w, l, 0);
         ROWS(w) for (int64_t c = r * w->width + w->from[l * w->rows + r]; c < r * w->width + w->to[l * w->rows + r]; c++) {
             float end = end_of(w, l, c);
-            for (int64_t m = 0; end < FAR && w->ahead[l * C + c] < FAR && m < M; m++)
-                best = lower(best, w->there[(l * M + m) * C + c] + end + t->last_cost[m]);
+            for (int64_t m = 0; end < FAR && w->ahead[l * C + c] < FAR && m < M; m++) {
+                float cost = w->there[(l * M + m) * C + c] + end + t->last_cost[m];
+                if (cost < best) best = cost, w->end[0] = l, w->end[1] = c, w->end[2] = m;
+            }
         }
         if (l == t->layers) break;
         spread(w, l);
@@ -337,7 +245,7 @@ static float sweep_there(Sweep *w) {
         }
         ROWS(w) if (w->from[l * w->rows + r] < w->to[l * w->rows + r]) lead(w, l, r);
         /* What no way has led to is left out, and what one that has ended undercuts. */
-        w->limit = best < FAR && t->earliest < t->layers ? best + (float)t->dearer * fabsf(best) : FAR;
+        w->limit = best < FAR && t->earliest < t->layers ? lower(limit, best + (float)t->dearer * fabsf(best)) : limit;
         trim(w, l + 1, 1);
     }
     return best;
@@ -399,6 +307,25 @@ static int64_t beside(const Sweep *w, int64_t m, int64_t i, float *change) {
     return found;
 }
 
+/* The cells of the cheapest way to a state, up to its layer; 0 where there is none. */
+static int trace_back(const Sweep *w, int64_t layer, int64_t cell, int64_t move, int32_t *way) {
+    way[layer] = (int32_t)cell;
+    for (int64_t l = layer; l > 0; l--) {
+        int64_t before = -1;
+        float least = FAR, change;
+        for (int a = 0; a < DIM; a++) cell -= w->move[move * DIM + a] * w->step[a];
+        way[l - 1] = (int32_t)cell;
+        for (int64_t i = 0; i < BESIDE; i++) {
+            int64_t k = beside(w, move, i, &change);
+            float cost = k < 0 ? FAR : state(w, w->there, l - 1, k, cell) + change;
+            if (cost < least) least = cost, before = k;
+        }
+        if (before < 0) return 0;
+        move = before;
+    }
+    return 1;
+}
+
 /* The cells of the cheapest way through a cell at a layer, and the layer at which it ends; 0 where there is none. */
 static int trace(const Sweep *w, int64_t layer, int64_t cell, int32_t *way, int32_t *end) {
     const Timed *t = w->t;
@@ -409,20 +336,7 @@ static int trace(const Sweep *w, int64_t layer, int64_t cell, int32_t *way, int3
         if (cost < least) least = cost, m = k;
     }
     if (least >= FAR) return 0;
-    way[layer] = (int32_t)cell;
-    int64_t from = cell, move = m;
-    for (int64_t l = layer; l > 0; l--) {
-        int64_t before = -1;
-        for (int a = 0; a < DIM; a++) from -= w->move[move * DIM + a] * w->step[a];
-        way[l - 1] = (int32_t)from, least = FAR;
-        for (int64_t i = 0; i < BESIDE; i++) {
-            int64_t k = beside(w, move, i, &change);
-            float cost = k < 0 ? FAR : state(w, w->there, l - 1, k, from) + change;
-            if (cost < least) least = cost, before = k;
-        }
-        if (before < 0) return 0;
-        move = before;
-    }
+    if (!trace_back(w, layer, cell, m, way)) return 0;
     for (int64_t l = layer; l <= t->layers; l++) {
         int64_t to = -1, next = -1;
         least = end_of(w, l, cell) + t->last_cost[m], cell_of(w, cell, at);
@@ -504,12 +418,29 @@ static void classes(const Sweep *w, Timed *t, const float *through, Least *found
     }
 }
 
+/* The cheapest way alone: it seldom costs much more than what lies ahead says, so few states are looked at. */
+static void cheapest(Sweep *w, Timed *t) {
+    float least = w->ahead[t->start], best = FAR, more = EXCESS;
+    for (int i = 0; i < DOUBLINGS && best >= FAR && least < FAR; i++, more *= 2.0f) {
+        float limit = i + 1 < DOUBLINGS ? least + more * fabsf(least) : FAR;
+        best = sweep_there(w, limit);
+        if (best > limit) best = FAR;
+    }
+    if (best >= FAR || !trace_back(w, w->end[0], w->end[1], w->end[2], t->way)) return;
+    *t->end = (int32_t)w->end[0], *t->cost = best, t->found = 1;
+}
+
 static void search(Timed *t, Sweep *w, float *through, float *scratch, Least *found) {
     t->found = 0;
     measure(w, scratch);
     look_between(w);
+    if (w->toll) ask_tolls(w);
     look_ahead(w, scratch);
-    float best = sweep_there(w);
+    if (t->most == 1 && !t->through) {
+        cheapest(w, t);
+        return;
+    }
+    float best = sweep_there(w, FAR);
     if (best >= FAR) {
         for (int64_t i = 0; i < (t->layers + 1) * w->cells; i++) through[i] = FAR;
         return;
@@ -530,22 +461,24 @@ static int solve(Timed *t) {
     size_t layers = (size_t)t->layers + 1, C = (size_t)w.cells, M = (size_t)w.moves, lines = layers * (size_t)w.rows;
     size_t wide = M * (size_t)w.width;
     int32_t *whole = malloc(sizeof(int32_t) * (M * DIM + 2 * lines));
-    float *numbers = malloc(sizeof(float) * (3 * layers * C + 2 * C + 2 * wide + 2 * (size_t)w.width));
-    w.there = malloc(sizeof(float) * layers * C * M), w.onward = malloc(sizeof(float) * layers * C * M);
+    int one = t->most == 1 && !t->through;
+    float *numbers = malloc(sizeof(float) * (3 * layers * C + 2 * C + 2 * wide + 3 * (size_t)w.width + DIM * M));
+    w.toll = t->others ? malloc(sizeof(float) * ((size_t)(t->layers * t->parts) + 1) * C) : NULL;
+    w.there = malloc(sizeof(float) * layers * C * M), w.onward = malloc(one ? 1 : sizeof(float) * layers * C * M);
     w.between = malloc(sizeof(Between) * M * (size_t)t->parts);
     Least *found = malloc(sizeof(Least) * layers * C);
-    int done = whole && numbers && w.there && w.onward && w.between && found;
+    int done = whole && numbers && (w.toll || !t->others) && w.there && w.onward && w.between && found;
     if (done) {
         float *through = numbers + 2 * layers * C, *scratch = numbers + 3 * layers * C;
         w.ahead = numbers, w.least = numbers + layers * C, w.row = scratch + 2 * C, w.wide = w.row + wide;
-        w.gap = w.wide + wide;
+        w.gap = w.wide + wide, w.paid = w.gap + 2 * w.width, w.along = w.paid + w.width;
         w.move = whole, w.from = whole + M * DIM, w.to = w.from + lines;
         for (int64_t m = 0; m < w.moves; m++)
             for (int a = 0; a < DIM; a++)
                 w.move[m * DIM + a] = (int32_t)(t->least[a] + m / w.turn[a] % t->moves[a]);
         search(t, &w, t->through ? t->through : through, scratch, found);
     }
-    free(whole), free(numbers), free(w.there), free(w.onward), free(w.between), free(found);
+    free(whole), free(numbers), free(w.toll), free(w.there), free(w.onward), free(w.between), free(found);
     return done;
 }
 

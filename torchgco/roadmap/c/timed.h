@@ -14,6 +14,9 @@ typedef struct {
     const float *center; /* (layers * parts + 1, solids, DIM): where they are, from the first cell, m */
     const float *half, *axes, *radius; /* (solids, DIM), (solids, DIM, DIM), (solids): m; rows of axes are sides */
     float *clearance; /* (layers * parts + 1, cells), m: of all else; then of the solids, too */
+    int64_t others; /* balls that may be met, at a price */
+    const float *other, *reach, *price; /* (layers * parts + 1, others, DIM), (others), (others): as center; m; of being
+                                           all the way inside for a layer */
     const float *cell_cost; /* (layers, cells): of being there until the next layer; FAR or more: nobody may be there */
     const float *end_cost; /* (layers + 1 - earliest, cells): of ending there; FAR or more: nobody may */
     const float *move_cost, *last_cost, *change; /* (moves), (moves): of the last one; (3): of one unit more or less */
