@@ -62,8 +62,14 @@ def take(tree: Any, index: Rows) -> Any:
     if isinstance(tree, tuple):
         rows = [leaf[index] if type(leaf) is Tensor else take(leaf, index) for leaf in tree]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
-    names = field_names(type(tree))
-    return _made(type(tree), taken(tree, names, index)) if names else tree
+    if not (names := field_names(type(tree))):
+        return tree
+    made = object.__new__(type(tree))  # its parts are checked and bound already
+    for name in names:
+        part = getattr(tree, name)
+        rows = part[index] if type(part) is Tensor else None if part is None else take(part, index)
+        object.__setattr__(made, name, rows)
+    return made
 
 
 def taken(tree: Any, names: tuple[str, ...], index: Rows) -> dict[str, Any]:
@@ -183,8 +189,11 @@ def copied(tree: Any) -> Any:
         return tuple([leaf.clone() if type(leaf) is Tensor else copied(leaf) for leaf in tree])
     if not (names := field_names(type(tree))):
         return tree
-    parts = ((name, getattr(tree, name)) for name in names)
-    return _made(type(tree), {name: part.clone() if type(part) is Tensor else copied(part) for name, part in parts})
+    made = object.__new__(type(tree))
+    for name in names:
+        part = getattr(tree, name)
+        object.__setattr__(made, name, part.clone() if type(part) is Tensor else None if part is None else copied(part))
+    return made
 
 
 def spread(values: Tensor, rows: Tensor) -> Tensor:

@@ -33,7 +33,7 @@ from torchgco.compiled.numbers import (
     with_own_numbers,
 )
 from torchgco.explaining.explain import Account
-from torchgco.kernels import cost_scale, cost_unit, current, held_on_cpu, interior_of, is_mixed, served_by
+from torchgco.kernels import cost_scale, current, held_on_cpu, interior_of, is_mixed, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
@@ -119,14 +119,14 @@ class Compiled:
             return
         if problem.time is not None:
             self._kept = kept_in_time(problem, self.interior.options(warm=True))
-            self._unit = self._unit if self._kept is None else cost_unit(self._kept.whole)
+            self._unit = self._unit if self._kept is None else cost_scale(self._kept.whole).unit
             return
         form = current(for_solvers(problem))
         if for_solvers(problem) is problem:
             kernels = interior_of(form)
             # What Python has read of a problem's own numbers stays in the code.
             if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
-                self._problem, self._unit = form, cost_unit(form)
+                self._problem, self._unit = form, cost_scale(form).unit
                 self._kept = Kept(kernels, form, cost_scale(form), self.interior.options(warm=True))
 
     def __call__(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers, numbers_of_fields
 from torchgco.base.tree import own_mapped
-from torchgco.kernels import cost_scale, cost_unit, current, interior_of
+from torchgco.kernels import cost_scale, current, interior_of
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.interior import InteriorEngine, Kept
@@ -195,7 +195,7 @@ class KeptInTime(KeptLifted):
     """
 
     def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
-        self.user, self.whole, self.unit = user, whole, cost_unit(whole)
+        self.user, self.whole, self.unit = user, whole, cost_scale(whole).unit
         super().__init__(kernels, whole.in_cost_units(), cost_scale(whole), options, user)
         pairs = zip(user.constraints, whole.constraints, strict=False)
         self._copied_parts = {i for i, (a, b) in enumerate(pairs) if a.joins_knots or _differ(a, b)}

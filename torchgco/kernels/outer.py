@@ -99,8 +99,7 @@ class NativeOuter:
         return self.out["status"] == End.ENDED
 
     def _run(self, **fields: int) -> None:
-        for name, value in fields.items():
-            setattr(self.outer, name, value)
+        self.outer.fill(fields)
         run(self.engine.library.tgco_outer, self.b, self.engine.lanes, self.outer)
 
 

@@ -86,15 +86,12 @@ def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) ->
     return kernels_of(problem).violation(problem, X, U, obstacles)
 
 
-def cost_unit(problem: Problem) -> Tensor:
-    """`problem.cost_unit` (B,), computed as `cost_scale`."""
-    return cost_scale(problem).unit
-
-
 def cost_scale(problem: Problem) -> CostScale:
     """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
+    if (known := problem.derived.get("cost_scale")) is not None:
+        return known
     whole = problem if problem.part_of is None else problem.part_of[0]
-    if "cost_scale" not in problem.derived and "cost_scale" not in whole.derived:
+    if "cost_scale" not in whole.derived:
         first = whole if whole.B <= problem.B else problem
         kernels_of(first).scale(first)
     return problem.cost_scale

@@ -151,20 +151,22 @@ def _facts(fields: Mapping[str, Any]) -> tuple[Hashable, ...]:
     return *facts, *(_Itself(fields[name]) for name in ("dynamics", "cost")), *facts_of(fields)
 
 
-def facts_of(tree: Any) -> Iterator[Hashable]:
+def facts_of(tree: Any) -> list[Hashable]:
     """What tells whether functions and numbers in nested parts have changed."""
+    facts = list[Hashable]()
     for leaf in leaves(tree):
         if isinstance(leaf, Tensor):
-            yield 0 if leaf.is_inference() else leaf._version
+            facts.append(0 if leaf.is_inference() else leaf._version)
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
-                yield _sum(leaf.detach())
+                facts.append(_sum(leaf.detach()))
         elif isinstance(leaf, (int, float, str, bytes, Number)) or leaf is None or type(leaf) in ALONE:
-            yield leaf
+            facts.append(leaf)
         elif callable(leaf):
-            yield _Itself(leaf)
+            facts.append(_Itself(leaf))
         elif isinstance(leaf, np.ndarray) or hasattr(leaf, "__array__") or isinstance(leaf, (Collection, memoryview)):
-            yield _sum(leaf)
+            facts.append(_sum(leaf))
+    return facts
 
 
 def _sum(numbers: Any) -> int | None:

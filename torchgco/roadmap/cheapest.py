@@ -143,8 +143,8 @@ class GraphSearch:
 
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
         """Call a function of the library on all problems, by as many threads as PyTorch uses."""
-        arguments = self._shared.copy()
-        arguments.fill({**{field: tensor.contiguous() for field, tensor in read.items()}, **written, **numbers})
+        contiguous = {field: tensor.contiguous() for field, tensor in read.items()}
+        arguments = self._shared.fill({**contiguous, **written, **numbers}, copied=True)
         run(getattr(self.library, name), self.obstacles.spheres.radii.shape[0], GROUP, arguments)
 
     @cached_property

@@ -25,7 +25,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Natural, Positive
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import put, take
-from torchgco.kernels import cost_unit, current_device, open_loop, value
+from torchgco.kernels import cost_scale, current_device, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
@@ -373,7 +373,7 @@ class Round:
         places: Tensor | None = None,
         record: SearchRecord | None = None,
     ) -> None:
-        self.watch, self.unit = watch, cost_unit(problem)
+        self.watch, self.unit = watch, cost_scale(problem).unit
         self.problem, scaled = problem, problem.in_cost_units()
         self.rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         everyone = torch.arange(problem.B, device=problem.x0.device)

@@ -21,7 +21,7 @@ from torchgco.base.shapes import check_shape, check_tensor, check_untransformed,
 from torchgco.base.status import Status
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.explain import Account
-from torchgco.kernels import copied_to, cost_unit, current, interior_of, is_mixed, kernels_of, on_cpu, served_by, used
+from torchgco.kernels import copied_to, cost_scale, current, interior_of, is_mixed, kernels_of, on_cpu, served_by, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
@@ -134,7 +134,7 @@ class Call:
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
-        unit = cost_unit(self.problem)
+        unit = cost_scale(self.problem).unit
         warm = None if self.warm is None else self.warm.scaled(1.0 / unit)
         return replace(self, problem=self.problem.in_cost_units(), warm=warm), unit
 

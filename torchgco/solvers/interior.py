@@ -15,7 +15,6 @@ from torchgco.ilqr.riccati import backward
 from torchgco.kernels import (
     at_once,
     cost_scale,
-    cost_unit,
     expect_interior,
     interior_of,
     measured,
@@ -53,7 +52,7 @@ def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
     if rows.numel() == 0 or call.late:
         return end
     problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
-    cost_unit(problem)
+    cost_scale(problem)
     multipliers = Multipliers.zero(problem, HEAVY)
     repaired, ended = descend(REPAIR, Lagrangian(problem.in_cost_units(), multipliers, None, phr=True), old.U)
     X, U, violation = repaired.X, repaired.U, measured(problem, repaired.X, repaired.U)

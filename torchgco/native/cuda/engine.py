@@ -134,7 +134,7 @@ class Kernel:
 
     def _run(self, argument: Any, first: int, last: int) -> None:
         if isinstance(argument, c.Problem):
-            argument = problem = argument.copy({"replicas": 1})  # a thread has a single lane
+            argument = problem = argument.fill({"replicas": 1}, copied=True)  # a thread has a single lane
         else:
             problem = c.Problem.from_address(argument.of)
         room = getattr(self.library.host, self.library.program.room_of(self.name))
