@@ -47,7 +47,7 @@ def is_forward() -> bool:
 
 def asks(tensor: Tensor) -> bool:
     """Whether a tensor asks for gradients, or has a tangent of forward mode."""
-    return tensor.requires_grad or (is_forward() and _has_tangent(tensor))
+    return tensor.requires_grad or (forward_ad._current_level >= 0 and _has_tangent(tensor))
 
 
 def _has_tangent(tensor: Tensor) -> bool:

@@ -28,7 +28,10 @@ class PerElement(Brief):
 
     def take(self, index: Rows) -> Self:
         """The same part for the problems in `index` (int64, (B',), or a slice)."""
-        changes = taken(self, self.batched, index)
+        changes = dict[str, Any]()
+        for name in self.batched:
+            value = getattr(self, name)
+            changes[name] = value[index] if type(value) is Tensor else None if value is None else take(value, index)
         for name in self.per_element:
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.dim() > 0 and value.shape[0] != 1:
@@ -54,13 +57,18 @@ def is_whole(index: Rows, B: int) -> bool:
 
 
 def take(tree: Any, index: Rows) -> Any:
-    """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
+    """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged.
+
+    Most parts are tensors, and each solve takes thousands: no call for these.
+    """
     if isinstance(tree, Tensor):
         return tree[index]
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        rows = [leaf[index] if type(leaf) is Tensor else take(leaf, index) for leaf in tree]
+        rows = [
+            leaf[index] if type(leaf) is Tensor else None if leaf is None else take(leaf, index) for leaf in tree
+        ]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
     if not (names := field_names(type(tree))):
         return tree
@@ -70,15 +78,6 @@ def take(tree: Any, index: Rows) -> Any:
         rows = part[index] if type(part) is Tensor else None if part is None else take(part, index)
         object.__setattr__(made, name, rows)
     return made
-
-
-def taken(tree: Any, names: tuple[str, ...], index: Rows) -> dict[str, Any]:
-    """Rows `index` of these attributes. Most are tensors, and each solve takes thousands: no call for these."""
-    parts = ((name, getattr(tree, name)) for name in names)
-    return {
-        name: part[index] if type(part) is Tensor else None if part is None else take(part, index)
-        for name, part in parts
-    }
 
 
 def changed(part: Any, changes: Mapping[str, Any]) -> Any:

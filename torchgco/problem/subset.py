@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from torchgco.base.tree import Rows, take, taken
+from torchgco.base.tree import Rows, take
 
 OF_BATCH = "dynamics", "cost", "constraints"  # what a subset takes of its batch when it is asked for
 ITS_OWN = "x0", "goal", "horizon", "free_start", "time"
@@ -34,7 +34,8 @@ class Subset:
         batch, rows = (self, rows) if self.part_of is None else (self.part_of[0], self.part_of[1][rows])
         made = object.__new__(type(self))
         sizes = {name: getattr(self, name) for name in ("N", "n", "m", "known")}
-        vars(made).update(taken(self, ITS_OWN, index), **sizes, derived={}, part_of=(batch, rows))
+        numbers = zip(ITS_OWN, take(tuple(getattr(self, name) for name in ITS_OWN), index), strict=True)
+        vars(made).update(numbers, **sizes, derived={}, part_of=(batch, rows))
         return made
 
     if not TYPE_CHECKING:
@@ -43,8 +44,9 @@ class Subset:
             """A part of a subset; kernels in C read those of the whole batch."""
             if name not in OF_BATCH or self.part_of is None:
                 raise AttributeError(f"{type(self).__name__} has no attribute {name}")
-            vars(self).update(taken(self.part_of[0], (name,), self.part_of[1]))
-            return vars(self)[name]
+            whole, rows = self.part_of
+            vars(self)[name] = part = take(getattr(whole, name), rows)
+            return part
 
     def derive(self, name: str, make: Callable[[], Any]) -> Any:
         """What `make` computes from this problem's parts, once; kept in `derived` under the name."""
