@@ -31,7 +31,7 @@ def recording() -> Iterator[None]:
 
 def not_recording() -> AbstractContextManager[None]:
     """Nothing is recorded, neither for backward passes nor of tensors in forward mode."""
-    return _without_tangents() if is_forward() else torch.no_grad()
+    return _without_tangents() if forward_ad._current_level >= 0 else torch.no_grad()
 
 
 @contextmanager

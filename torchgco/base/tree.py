@@ -49,13 +49,6 @@ def is_users(part: object) -> bool:
     return getattr(part, "calls_function", False) or type(part).__module__.partition(".")[0] != "torchgco"
 
 
-def is_whole(index: Rows, B: int) -> bool:
-    """Whether an index takes all B problems in their order."""
-    if isinstance(index, slice):
-        return index.indices(B) == (0, B, 1)
-    return index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
-
-
 def take(tree: Any, index: Rows) -> Any:
     """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged.
 

@@ -38,8 +38,9 @@ def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
     """
     if problem.time is not None:
         return in_time(problem)
-    within = within_horizons(problem)
-    return within if joins_knots else with_carried(within)
+    within = problem if problem.horizon is None else within_horizons(problem)
+    carries = not joins_knots and any(row.joins_knots for row in within.constraints)
+    return with_carried(within) if carries else within
 
 
 def within_horizons(problem: Problem) -> Problem:

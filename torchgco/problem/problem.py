@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole
+from torchgco.base.tree import Rows, cast, field_names, is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -127,6 +127,11 @@ class Problem(Subset):
     @cached_property
     def m(self) -> int:
         return self.dynamics.m
+
+    @cached_property
+    def users(self) -> tuple[Any, ...]:
+        """The parts whose code is a user's."""
+        return tuple(part for part in (*self.constraints, self.cost, self.dynamics) if is_users(part))
 
     @property
     def along(self) -> Dynamics:
@@ -258,7 +263,12 @@ class Problem(Subset):
         """
         if isinstance(index, list):
             index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
-        if is_whole(index, self.B):
+        B = self.B
+        if isinstance(index, slice):
+            whole = index.indices(B) == (0, B, 1)
+        else:
+            whole = index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
+        if whole:
             return self
         subset = self.subset(index)
         if self.given is not None:
