@@ -59,9 +59,7 @@ def take(tree: Any, index: Rows) -> Any:
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        rows = [
-            leaf[index] if type(leaf) is Tensor else None if leaf is None else take(leaf, index) for leaf in tree
-        ]
+        rows = [leaf[index] if type(leaf) is Tensor else None if leaf is None else take(leaf, index) for leaf in tree]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
     if not (names := field_names(type(tree))):
         return tree

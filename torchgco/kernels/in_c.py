@@ -17,8 +17,9 @@ from torchgco.ilqr.line_search import Rollouts, rungs_of
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import Descent, keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
-from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
+from torchgco.kernels.outer import NativeOuter, blank_end, pass_end
 from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
+from torchgco.native.cuda.engine import current_device
 from torchgco.native.engine import OF_MODEL, OF_ROWS, Engine, Sampler, run
 from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_problem import KeptDescent
@@ -46,6 +47,7 @@ class NativeKernels(Kernels):
     def __init__(self, engine: Engine, warn: Callable[[Exception], None]) -> None:
         self.engine, self._warn, self.affine = engine, warn, engine.model.affine
         self._samplers: dict[Hashable, Sampler] = {}
+        self._interiors: dict[Hashable, InteriorEngine] = {}
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         X = U.new_empty(problem.B, problem.N + 1, problem.n)
@@ -108,15 +110,14 @@ class NativeKernels(Kernels):
         return worst
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
-        parts = [c.bare for c in problem.constraints]
-        others = [row for row in parts if type(row) is not BoundSpheres]
-        if len(others) == len(parts):
+        others = [row for row in problem.distances if type(row) is not BoundSpheres]
+        if len(others) == len(problem.distances):
             return clearance_of(others, X, share)
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
         contact = 1.0 - (TOUCH if share is None else share)
         packed = self.engine.packed(problem, OF_ROWS, X=X.contiguous(), U=U, merit=least, gain=contact)
         run(self.engine.library.tgco_chords, problem.B, self.engine.lanes, packed)
-        return clearance_of(others, X, share, least)
+        return clearance_of(others, X, share, least) if others else least
 
     def rolled_out(self, problem: Problem, X: Tensor, U: Tensor, gains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         B, worst = problem.B, X.new_empty(problem.B)
@@ -159,7 +160,7 @@ class NativeKernels(Kernels):
         B = lagrangian.problem.B
         for name in ITERATED:
             setattr(s, name, getattr(s, name).contiguous())
-        out = {name: _flags(B) for name in END_FLAGS} | {name: s.merit.new_zeros(B) for name in END_NUMBERS}
+        out = blank_end(B)
         state = {name: getattr(s, name) for name in ITERATED}
         packed = self.engine.terms(
             lagrangian, **state, **out, options=native_options(how), limit=limit,
@@ -194,11 +195,14 @@ class NativeKernels(Kernels):
         return NativeOuter(self.engine, native_options(how), problem, s, **limits) if self.engine.measures else None
 
     def interior(self, problem: Problem) -> InteriorKernels:
-        try:
-            return InteriorEngine(self.engine)
-        except InputError as error:  # second derivatives whose code would be too long
-            self._warn(error)
-            return super().interior(problem)
+        served = current_device(), self.engine.B
+        if served not in self._interiors:
+            try:
+                self._interiors[served] = InteriorEngine(self.engine)
+            except InputError as error:  # second derivatives whose code would be too long
+                self._warn(error)
+                return super().interior(problem)
+        return self._interiors[served]
 
     def sample(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         if how.dtype not in self._samplers:  # compiled at the first call: most solves never sample

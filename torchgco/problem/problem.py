@@ -14,7 +14,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast, field_names, is_users
-from torchgco.constraints.base import Constraint
+from torchgco.constraints.base import Constraint, Distance
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -130,8 +130,14 @@ class Problem(Subset):
 
     @cached_property
     def users(self) -> tuple[Any, ...]:
-        """The parts whose code is a user's."""
-        return tuple(part for part in (*self.constraints, self.cost, self.dynamics) if is_users(part))
+        """The parts whose code is a user's; of a subset those of the batch."""
+        whole = self if self.part_of is None else self.part_of[0]
+        return tuple(part for part in (*whole.constraints, whole.cost, whole.dynamics) if is_users(part))
+
+    @cached_property
+    def bends(self) -> bool:
+        """Whether positions may leave the straight lines between their knots: by Euler's steps they don't."""
+        return self.dynamics.stretches and self.dynamics.integrator != "euler"
 
     @property
     def along(self) -> Dynamics:
@@ -148,7 +154,7 @@ class Problem(Subset):
         """Which stages are a problem's own, (B, N) bool."""
         return torch.arange(self.N, device=self.x0.device) < self.stages.unsqueeze(-1)
 
-    @property
+    @cached_property
     def position(self) -> slice:
         """The position's place in the state.
 
@@ -160,15 +166,20 @@ class Problem(Subset):
             raise InputError("dynamics.position", "a model with a position", type(self.dynamics).__name__)
         return where
 
-    @property
+    @cached_property
     def geometric(self) -> tuple[Constraint, ...]:
         """The constraints on position that sampling and guidance consider."""
         return tuple(c for c in self.constraints if c.geometric)
 
-    @property
+    @cached_property
     def obstacles(self) -> tuple[Obstacles, ...]:
         """The constraints that are obstacles, of whatever kind."""
         return tuple(c for c in self.constraints if isinstance(c, Obstacles))
+
+    @cached_property
+    def distances(self) -> tuple[Any, ...]:
+        """The user's constraints that keep a distance, which is measured between knots, too."""
+        return tuple(row for constraint in self.constraints if isinstance(row := constraint.bare, Distance))
 
     @property
     def control_bounds(self) -> Bounds | None:
@@ -211,7 +222,7 @@ class Problem(Subset):
         changes = torch.maximum(changes, savings(slopes, curvatures))
         return cost_scale(total, curvatures[:, :-1, self.n :], changes, self.horizon, self.control_bounds)
 
-    @property
+    @cached_property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
         """Knots and rows of every constraint; the same for all problems of a form."""
         shapes = self.known.row_shapes

@@ -252,7 +252,7 @@ class PathProposals(Row):
         live = paths.live.repeat_interleave(starts.shape[1], dim=1)
         candidates = Candidates.begin(problem, starts.repeat(1, K, 1, 1), paths.R, paths.unit, live, watch)
         tracked = follow.track(candidates, paths, free)
-        relaxed, sound = self.relax(tracked.pick(tracked.order(tracked.arrive())[:, : self.relax_top]))
+        relaxed, sound = self.relax(tracked.pick(tracked.order(tracked.arrive)[:, : self.relax_top]))
         order = relaxed.order(sound, SAME_COST)[:, : self.refine.top]
         picked = sound[relaxed.rows(order).flatten()]
         refined = relaxed.pick(order).refined(picked, self.refine, follow.iterations)
@@ -270,11 +270,11 @@ class PathProposals(Row):
         if self.relax_iterations > 0:
             relaxed = candidates.solved(inner_solver(self.relax_iterations), CANDIDATE_PENALTY)
             # A candidate that falls back into the trap, where waiting is cheaper, stays as tracked.
-            keeps = (relaxed.arrive() | ~candidates.arrive()).view(-1, 1, 1)
+            keeps = (relaxed.arrive | ~candidates.arrive).view(-1, 1, 1)
             X, U = torch.where(keeps, relaxed.X, candidates.X), torch.where(keeps, relaxed.U, candidates.U)
             candidates = replace(relaxed, X=X, U=U)
         shallow = candidates.penetration() <= self.max_penetration * candidates.R
-        return candidates, candidates.live & candidates.arrive() & shallow
+        return candidates, candidates.live & candidates.arrive & shallow
 
 
 class Part:
@@ -357,7 +357,7 @@ class Part:
         bare = without_obstacles(self.problem.take(rows)) if rows.numel() > 0 else None
         if bare is None or len(bare.constraints) == len(bare.obstacles):
             return least
-        end = WITHOUT_OBSTACLES.solved(Call.checked(bare, self.rest[rows]))
+        end = WITHOUT_OBSTACLES.solved(Call.within(bare, self.rest[rows]))
         self.proposal.iterations[rows] += end.iterations
         return torch.where(end.best.violation <= ADMITTED, end.best.cost, least)
 

@@ -102,16 +102,22 @@ class Call:
         check_value(callback, Callable | None, "callback")
         deadline = None if max_seconds is None else clock.seconds() + max_seconds
         problem.check_controls(U0)
-        rows = torch.arange(problem.B, device=problem.x0.device)
-        if ids is None:
-            ids = rows
-        else:
+        if ids is not None:
             check_ids(ids, problem)
         if warm is not None:
             if not isinstance(warm, Multipliers):
                 raise InputError("warm", "Multipliers, such as those of a solution", type(warm).__name__)
             warm.check(problem)
-        return cls(current(problem), U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
+        made = cls.within(current(problem), U0, warm, callback)
+        return replace(made, seed=seed, ids=made.ids if ids is None else ids, deadline=deadline)
+
+    @classmethod
+    def within(
+        cls, problem: Problem, U0: Tensor, warm: Multipliers | None = None, callback: Callback | None = None
+    ) -> Call:
+        """A call within another solve, of what that has made."""
+        rows = torch.arange(problem.B, device=problem.x0.device)
+        return cls(problem, U0, 0, rows, rows, torch.zeros_like(rows), warm, callback)
 
     @property
     def late(self) -> bool:
