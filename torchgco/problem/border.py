@@ -19,7 +19,7 @@ from torchgco.base.mixing import foreign, why
 from torchgco.base.options import Seconds, check_value
 from torchgco.base.shapes import MISTAKES, check_tensor, describe
 from torchgco.base.tree import is_users
-from torchgco.base.values import asks_for_knot, whole_numbers_become
+from torchgco.base.values import taken_by, whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost, FunctionCost
@@ -149,7 +149,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or taken_by(cost.stage_function).knot
     _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
     if type(cost).total is Cost.total:
         _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
@@ -244,7 +244,7 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
     if differing is not None:
         got = f"rows of knot {int(knots[differing])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
-    _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
+    _check_axes(field, constraint.take(rows).rows_at, taken_by(constraint.function).knot, knots, *arguments)
 
 
 def check_eager(dynamics: Dynamics, cost: Cost, constraints: Sequence[Constraint], x0: Tensor, N: int) -> None:
