@@ -20,7 +20,7 @@ from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
 from torchgco.kernels.outer import NativeOuter, blank_end, pass_end
 from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
 from torchgco.native.cuda.engine import current_device
-from torchgco.native.engine import OF_MODEL, OF_ROWS, Engine, Sampler, run
+from torchgco.native.engine import OF_MODEL, OF_ROWS, WHOLE, Engine, Sampler, run
 from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_problem import KeptDescent
 from torchgco.native.structures import Options
@@ -94,9 +94,9 @@ class NativeKernels(Kernels):
         slopes, H, none = X.new_empty(B, N + 1, size), X.new_empty(B, N + 1, size, size), X.new_zeros(B)
         values = {"X": X.contiguous(), "U": U.contiguous(), "cost": none, "merit": none}
         if lagrangian is None:
-            packed = self.engine.packed(problem, **values, mu=none, constraints=0)
+            packed = self.engine.packed(problem, WHOLE, **values, mu=none, constraints=0)
         else:
-            packed = self.engine.terms(lagrangian, **values)
+            packed = self.engine.terms(lagrangian, None, **values)
         packed.slopes, packed.curvatures = slopes, H
         run(self.engine.library.tgco_expand, B, self.engine.lanes, packed)
         return slopes, H
@@ -163,7 +163,7 @@ class NativeKernels(Kernels):
         out = blank_end(B)
         state = {name: getattr(s, name) for name in ITERATED}
         packed = self.engine.terms(
-            lagrangian, **state, **out, options=native_options(how), limit=limit,
+            lagrangian, None, **state, **out, options=native_options(how), limit=limit,
             replicas=self.engine.replicas_of(B),
         )  # fmt: skip
         library = self.engine.library
@@ -182,7 +182,7 @@ class NativeKernels(Kernels):
         state = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in starts.items()}
         accepted, mu_r = _flags(lagrangian.problem.B), torch.zeros_like(merit)
         packed = self.engine.terms(
-            lagrangian, **state, converged=accepted, regularisation=mu_r, limit=iteration.LIFTED_STEPS,
+            lagrangian, None, **state, converged=accepted, regularisation=mu_r, limit=iteration.LIFTED_STEPS,
             gain=iteration.GAIN,
         )  # fmt: skip
         run(self.engine.library.tgco_lift, lagrangian.problem.B, self.engine.lanes, packed)

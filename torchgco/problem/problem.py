@@ -186,7 +186,7 @@ class Problem(Subset):
         """The bounds on controls, those of several parts as one; None where there are none."""
         return joined_bounds(bounds_of(self.constraints, "u"), self.N)
 
-    @property
+    @cached_property
     def start_is_clear(self) -> Tensor:
         """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
         find = lambda p: clear_starts(p.constraints, p.x0, p.free_start, p.dynamics.position)

@@ -26,15 +26,19 @@ class Subset:
     derived: ClassVar[dict[str, Any]]
     part_of: ClassVar[tuple[Any, Tensor] | None] = None
     B: Any
+    x0: Any
 
     def subset(self, index: Rows) -> Self:
         """The problems in `index` (int64, (B',), or a slice)."""
-        own: Any = self
-        rows = torch.arange(self.B, device=own.x0.device)[index] if isinstance(index, slice) else index.clone()
+        rows = torch.arange(self.B, device=self.x0.device)[index] if isinstance(index, slice) else index.clone()
         batch, rows = (self, rows) if self.part_of is None else (self.part_of[0], self.part_of[1][rows])
         made = object.__new__(type(self))
         sizes = {name: getattr(self, name) for name in ("N", "n", "m", "known")}
-        numbers = zip(ITS_OWN, take(tuple(getattr(self, name) for name in ITS_OWN), index), strict=True)
+        parts = ((name, getattr(self, name)) for name in ITS_OWN)
+        numbers = {
+            name: part if part is None else part[index] if isinstance(part, Tensor) else part.take(index)
+            for name, part in parts
+        }
         vars(made).update(numbers, **sizes, derived={}, part_of=(batch, rows))
         return made
 

@@ -54,7 +54,7 @@ def current_device() -> OnDevice | None:
 def at_once(most: int) -> int:
     """How many problems are worked on together: `most`, which bounds memory and the time between two reports; where a
     device serves, with a thread for each, more."""
-    return most if current_device() is None else max(most, AT_ONCE)
+    return most if _device.get() is None else max(most, AT_ONCE)
 
 
 @contextmanager
