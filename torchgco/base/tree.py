@@ -59,15 +59,17 @@ def take(tree: Any, index: Rows) -> Any:
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        rows = [leaf[index] if type(leaf) is Tensor else None if leaf is None else take(leaf, index) for leaf in tree]
+        rows: list[Any] = [
+            leaf[index] if type(leaf) is Tensor else None if leaf is None else take(leaf, index) for leaf in tree
+        ]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
     if not (names := field_names(type(tree))):
         return tree
     made = object.__new__(type(tree))  # its parts are checked and bound already
     for name in names:
         part = getattr(tree, name)
-        rows = part[index] if type(part) is Tensor else None if part is None else take(part, index)
-        object.__setattr__(made, name, rows)
+        taken = part[index] if type(part) is Tensor else None if part is None else take(part, index)
+        object.__setattr__(made, name, taken)
     return made
 
 
