@@ -14,7 +14,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
 from torchgco.base.tree import Rows, cast, field_names, is_users
-from torchgco.constraints.base import Constraint, Distance
+from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
 from torchgco.costs.quadratic import BoundQuadratic
@@ -128,17 +128,6 @@ class Problem(Subset):
     def m(self) -> int:
         return self.dynamics.m
 
-    @cached_property
-    def users(self) -> tuple[Any, ...]:
-        """The parts whose code is a user's; of a subset those of the batch."""
-        whole = self if self.part_of is None else self.part_of[0]
-        return tuple(part for part in (*whole.constraints, whole.cost, whole.dynamics) if is_users(part))
-
-    @cached_property
-    def bends(self) -> bool:
-        """Whether positions may leave the straight lines between their knots: by Euler's steps they don't."""
-        return self.dynamics.stretches and self.dynamics.integrator != "euler"
-
     @property
     def along(self) -> Dynamics:
         """The dynamics of all stages together, for states (B, N, n) and controls (B, N, m)."""
@@ -175,11 +164,6 @@ class Problem(Subset):
     def obstacles(self) -> tuple[Obstacles, ...]:
         """The constraints that are obstacles, of whatever kind."""
         return tuple(c for c in self.constraints if isinstance(c, Obstacles))
-
-    @cached_property
-    def distances(self) -> tuple[Any, ...]:
-        """The user's constraints that keep a distance, which is measured between knots, too."""
-        return tuple(row for constraint in self.constraints if isinstance(row := constraint.bare, Distance))
 
     @property
     def control_bounds(self) -> Bounds | None:
