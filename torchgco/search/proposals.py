@@ -313,26 +313,22 @@ class Part:
 
     def _sought(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
         """`seek`."""
+        scene, known = self.scene, list[tuple[Tensor, Tensor]]()
+        assert scene is not None
         with computing_on(self.rest.device):
-            return self._sought_here(rows, roadmaps, count)
-
-    def _sought_here(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
-        assert self.scene is not None
-        R, unit = (scale[rows] for scale in self.scales)
-        usable, known = torch.isfinite(unit) & (unit > 0), []
-        found = torch.zeros_like(usable)
-        for number, roadmap in enumerate(roadmaps):
-            if any(roadmap.repeats(other, self.scene) for other in roadmaps[:number]):
-                continue
-            corners, arrives = paths_through(roadmap, self.scene, count, rows, self.known)
-            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
-            found = found | (arrives & usable)
-        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
-        obstacles = self.scene.obstacles
-        obstacles = obstacles if rows.numel() == self.problem.B else take(obstacles, rows)
-        label = classes(corners, obstacles)
-        first = label == torch.arange(label.shape[1], device=label.device)
-        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
+            R, unit = (scale[rows] for scale in self.scales)
+            usable, found = torch.isfinite(unit) & (unit > 0), torch.zeros_like(rows, dtype=torch.bool)
+            for number, roadmap in enumerate(roadmaps):
+                if any(roadmap.repeats(other, scene) for other in roadmaps[:number]):
+                    continue
+                corners, arrives = paths_through(roadmap, scene, count, rows, self.known)
+                known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
+                found = found | (arrives & usable)
+            corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
+            obstacles = scene.obstacles if rows.numel() == self.problem.B else take(scene.obstacles, rows)
+            label = classes(corners, obstacles)
+            first = label == torch.arange(label.shape[1], device=label.device)
+            return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
         """Record a comparison for the problems in `rows`; see `comparison`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
@@ -219,30 +219,23 @@ class Solver(Brief, Checked):
 
         def run(problem: Problem) -> Solution:
             left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
-            return self._found(problem, U0, seed, ids, warm, callback, left, X0)
+            options = {"seed": seed, "ids": ids, "callback": callback, "max_seconds": left}
+            return self._found(problem, U0, warm, X0, options)
 
         return spared(problem, run)
 
     def _found(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int,
-        ids: Tensor | None,
-        warm: Multipliers | None,
-        callback: Callback | None,
-        max_seconds: float | None,
-        X0: Tensor | None,
+        self, problem: Problem, U0: Tensor, warm: Multipliers | None, X0: Tensor | None, options: Mapping[str, Any]
     ) -> Solution:
-        """`solve`."""
+        """`solve`, with further arguments of `Call.checked`."""
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with
-                Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
+                Call.checked(problem, U0, warm=warm, **options)
                 return replace(Solution.empty(problem), account=Account(problem, self))
             whole = for_solvers(problem, self.joins_knots)
             if X0 is not None:
                 check_states(X0, problem)
-            made = partial(Call.checked, whole, seed=seed, ids=ids, callback=callback, max_seconds=max_seconds)
+            made = partial(Call.checked, whole, **options)
             if problem.time is not None:
                 return self._in_time(problem, whole, U0, warm, X0, made)
             if problem.horizon is not None:
