@@ -124,7 +124,8 @@ def step_errors(
                 lams = None if multipliers is None else tuple(lam[numbers] for lam in multipliers)
                 t = None if times is None else times[numbers]
                 part = _Differences(problem.take(numbers), X[numbers], U[numbers], e[chosen], t, lams)
-                part = replace(part, slopes=None if costates is None else part.found_by(costates))
+                if costates is not None:
+                    part = replace(part, slopes=costates(part.problem, part.X, part.U, lams or ()))
                 costs[chosen] = part.cost(total[chosen], too_much[numbers] if doubted else None)
             error.step_cost[rows] = costs
         large = error.step_error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR)
@@ -221,9 +222,6 @@ class _Differences:
     times: Tensor | None
     multipliers: tuple[Tensor, ...] | None  # None: controls don't answer
     slopes: Tensor | None = None  # (B, N+1, n), of the cost by the states, where later states follow
-
-    def found_by(self, costates: Costates) -> Tensor | None:
-        return costates(self.problem, self.X, self.U, self.multipliers or ())
 
     def take(self, rows: Tensor) -> _Differences:
         if (problem := self.problem.take(rows)) is self.problem:
