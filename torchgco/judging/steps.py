@@ -275,15 +275,16 @@ def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
     """
     z, n = F.shape[2], F.shape[2] - 2
     V, rows, steps = H[:, -1, :z, :z], H.unbind(1), F.unbind(1)
+    whole = torch.eye(F.shape[3], z).to(F).repeat(len(F), 1, 1)  # [z, u] from z
+    K = whole[:, z:, :n]
     for k in range(len(steps) - 1, -1, -1):
         Q = torch.baddbmm(rows[k], steps[k].mT, V @ steps[k])
-        V = Q[:, :z, :z]
         if feedback:
             L, failed = torch.linalg.cholesky_ex(Q[:, z:, z:])
-            K = Q.new_zeros(*Q.shape[:1], Q.shape[1] - z, z)
-            K[:, :, :n] = torch.where(failed.view(-1, 1, 1) == 0, -torch.cholesky_solve(Q[:, z:, :n], L), 0.0)
-            answer = K.mT @ torch.baddbmm(Q[:, z:, :z], Q[:, z:, z:], K, alpha=0.5)
-            V = V + answer + answer.mT
+            torch.neg(torch.cholesky_solve(Q[:, z:, :n], L), out=K)
+            if bool(failed.any()):
+                K[failed != 0] = 0.0
+        V = whole.mT @ (Q @ whole)
     return V[:, n, n + 1], 0.5 * V[:, n + 1, n + 1]
 
 
