@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from difflib import get_close_matches
@@ -24,6 +24,7 @@ from torchgco.fleets.solve import solve_fleet
 from torchgco.guesses import Guess, guesses_of, solve_guesses
 from torchgco.judging.judge import judge, judged_columns
 from torchgco.kernels import copied_to, current, is_mixed, on_cpu, open_loop, served_by
+from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.phases import Phases, PhasesSolution
 from torchgco.phases.solution import solve_phases
 from torchgco.presets import named
@@ -147,20 +148,26 @@ def solve(
         problem, U0 = spared(problem, partial(_start, warm, solver, U0))
         multipliers, verbose = None if warm is None else warm.multipliers, check_value(verbose, bool | None, "verbose")
         watcher = Watcher(name or type(solver).__name__, problem.B, isinstance(solver, Restarts), verbose)
-        options = {"seed": seed, "ids": ids, "max_seconds": max_seconds}
-        if tried is None:
-            found = _watched(watcher, solver.solve, problem, U0, warm=multipliers, X0=X0, **options)
-        else:
-            found = _watched(watcher, solve_guesses, solver, tried, problem, U0, **options)
+        found = _watched(watcher, solver, tried, (problem, U0, seed, ids, multipliers), max_seconds, X0)
         warn_of(problem, found, warm is None)
         problem, found = _returned(asked, problem, found, name)
         return attached(asked, problem, found, smoothing, differentiates) if differentiates or smoothing else found
 
 
-def _watched(watcher: Watcher, solve: Callable[..., Solution], *call: Any, **options: Any) -> Solution:
-    """The solution of a call, under the eyes of the watcher."""
+def _watched(
+    watcher: Watcher,
+    solver: Solver,
+    guesses: Sequence[Guess] | None,
+    call: tuple[Problem, Tensor, int, Tensor | None, Multipliers | None],
+    max_seconds: float | None,
+    X0: Tensor | None,
+) -> Solution:
+    """The solution of a call, from several guesses where there are some, under the eyes of the watcher."""
     with closing(watcher):
-        found = solve(*call, callback=watcher.callback, **options)
+        if guesses is None:
+            found = solver.solve(*call, watcher.callback, max_seconds, X0)
+        else:
+            found = solve_guesses(solver, guesses, *call[:4], watcher.callback, max_seconds)
         watcher.end(found)
         return found
 

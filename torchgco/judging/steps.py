@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -273,19 +274,31 @@ def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
     Args:
         F: of two halves, (B, N, n+2, s); H: slopes and curvatures, (B, N+1, s, s).
     """
-    z, n = F.shape[2], F.shape[2] - 2
-    V, rows, steps = H[:, -1, :z, :z], H.unbind(1), F.unbind(1)
-    whole = torch.eye(F.shape[3], z).to(F).repeat(len(F), 1, 1)  # [z, u] from z
-    K = whole[:, z:, :n]
-    for k in range(len(steps) - 1, -1, -1):
-        Q = torch.baddbmm(rows[k], steps[k].mT, V @ steps[k])
-        if feedback:
-            L, failed = torch.linalg.cholesky_ex(Q[:, z:, z:])
-            torch.neg(torch.cholesky_solve(Q[:, z:, :n], L), out=K)
-            if bool(failed.any()):
-                K[failed != 0] = 0.0
-        V = whole.mT @ (Q @ whole)
+    (B, N, z, s), n = F.shape, F.shape[2] - 2
+    # In NumPy, as an operation of PyTorch on a few small matrices takes several times as long.
+    steps, rows = (np.ascontiguousarray(blocks.transpose(0, 1).cpu().numpy()) for blocks in (F, H))
+    V, whole = rows[-1, :, :z, :z], np.zeros((B, s, z), rows.dtype)
+    whole[:, :z] = np.eye(z)  # [z, u] from z
+    turned, back = np.ascontiguousarray(steps.swapaxes(2, 3)), whole.swapaxes(1, 2)
+    with np.errstate(all="ignore"):
+        for k in range(N - 1, -1, -1):
+            Q = rows[k] + turned[k] @ (V @ steps[k])
+            if feedback:
+                whole[:, z:, :n] = -_solutions(Q[:, z:, z:], Q[:, z:, :n])
+            V = back @ (Q @ whole)
+    V = torch.from_numpy(V).to(F.device)
     return V[:, n, n + 1], 0.5 * V[:, n + 1, n + 1]
+
+
+def _solutions(S: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """S^-1 right (B, m, n), of matrices S (B, m, m); 0 where one isn't positive definite."""
+    try:
+        np.linalg.cholesky(S)
+        return np.linalg.solve(S, right)
+    except np.linalg.LinAlgError:
+        L, failed = torch.linalg.cholesky_ex(torch.from_numpy(S))
+        solutions = torch.cholesky_solve(torch.from_numpy(right), L)
+        return torch.where(failed.view(-1, 1, 1) == 0, solutions, 0.0).numpy()
 
 
 def _slopes(
