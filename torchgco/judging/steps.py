@@ -284,21 +284,24 @@ def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
         for k in range(N - 1, -1, -1):
             Q = rows[k] + turned[k] @ (V @ steps[k])
             if feedback:
-                whole[:, z:, :n] = -_solutions(Q[:, z:, z:], Q[:, z:, :n])
+                S, right = Q[:, z:, z:], -Q[:, z:, :n]
+                try:
+                    np.linalg.cholesky(S)
+                    whole[:, z:, :n] = np.linalg.solve(S, right)
+                except np.linalg.LinAlgError:
+                    whole[:, z:, :n] = [_solution(*of_each) for of_each in zip(S, right, strict=True)]
             V = back @ (Q @ whole)
     V = torch.from_numpy(V).to(F.device)
     return V[:, n, n + 1], 0.5 * V[:, n + 1, n + 1]
 
 
-def _solutions(S: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """S^-1 right (B, m, n), of matrices S (B, m, m); 0 where one isn't positive definite."""
+def _solution(S: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """S^-1 right (m, n), the same bits as in a batch; 0 where S isn't positive definite."""
     try:
         np.linalg.cholesky(S)
         return np.linalg.solve(S, right)
     except np.linalg.LinAlgError:
-        L, failed = torch.linalg.cholesky_ex(torch.from_numpy(S))
-        solutions = torch.cholesky_solve(torch.from_numpy(right), L)
-        return torch.where(failed.view(-1, 1, 1) == 0, solutions, 0.0).numpy()
+        return np.zeros_like(right)
 
 
 def _slopes(
