@@ -141,7 +141,8 @@ def solve_guesses(
     else:
         left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
         states = None if X0 is None else X0[chosen]
-        end = _continued(solver, problem, best, (U0[chosen], states), seed, ids, callback, left)
+        options = {"seed": seed, "ids": ids, "callback": callback, "max_seconds": left}
+        end = _continued(solver, problem, best, (U0[chosen], states), options)
         end = replace(end, **{name: getattr(end, name) + count for name, count in counts.items()})
     table = (getattr(found, name).view(-1, k) for name in ("cost", "violation", "status", "iterations"))
     return replace(end, guess=chosen % k, guesses=GuessRecord(*table))
@@ -161,16 +162,10 @@ def _best(problem: Problem, found: Solution, touching: Tensor, k: int) -> Tensor
 
 
 def _continued(
-    solver: Solver,
-    problem: Problem,
-    best: Solution,
-    guess: tuple[Tensor, Tensor | None],
-    seed: int,
-    ids: Tensor | None,
-    callback: Callback | None,
-    max_seconds: float | None,
+    solver: Solver, problem: Problem, best: Solution, guess: tuple[Tensor, Tensor | None], options: Mapping[str, Any]
 ) -> Solution:
-    """What the solver makes of the best local solutions; of these, U0 (B, N, m) and maybe X0 are the guess."""
+    """What the solver makes of the best local solutions, by options of its `solve`; U0 (B, N, m) and maybe X0 are
+    their guess."""
     U0, X0 = guess
     sound = (torch.isfinite(best.cost) & torch.isfinite(best.U).flatten(1).all(-1)).view(-1, 1, 1)
     U, X, start = torch.where(sound, best.U, U0), None, problem
@@ -181,7 +176,7 @@ def _continued(
         )
     elif problem.free_start is not None:
         start = problem.guessing(torch.where(sound[:, 0], best.X[:, 0], problem.x0))
-    end = solver.solve(start, U, seed, ids, None, callback, max_seconds, X)
+    end = solver.solve(start, U, X0=X, **options)
     least = replace(end, cost=end.cost - STATIONARY * end.cost.abs())  # which may be left in a stationary one
     clear = ~touches(problem, best)
     rows = (is_preferred(problem, best, least, ADMITTED) & clear).nonzero().flatten()

@@ -29,6 +29,7 @@ from torchgco import (
     certify,
     judge,
 )
+from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.steps import step_errors
 from torchgco.kernels import costates, current
 
@@ -435,6 +436,23 @@ def test_limits_and_unit_quaternions_are_kept_within_half_steps() -> None:
     U = torch.full((1, 5, 4), 15000.0, dtype=D) if speed is None else speed.unsqueeze(1).expand(1, 5, 4)
     found = judge(hover, U.contiguous())
     assert float(found.step_error) < 0.05 and bool(torch.isfinite(found.step_cost).all())
+
+
+def test_a_problem_without_a_regulator_leaves_others_as_they_are() -> None:
+    """Where the cost is concave in the controls, these stay; the problems beside it keep their bits."""
+    problem = planar_batch(B=5, N=20)[0]
+    weights = torch.tensor([1.0, -1e3, 0.5, 2.0, -1e3], dtype=D)
+    cost = FunctionCost(
+        lambda x, u, w: x.square().sum(-1) + w * u.square().sum(-1), lambda x: x.square().sum(-1), values={"w": weights}
+    )
+    problem = Problem(problem.dynamics, cost, [], problem.x0, 20)
+    U = 0.1 * torch.ones(5, 20, problem.m, dtype=D)
+    X = open_loop(problem.dynamics, problem.x0, U)
+    whole = step_errors(problem, X, U, None, ()).step_cost
+    for b in range(5):
+        rows = torch.tensor([b])
+        assert torch.equal(step_errors(problem.take(rows), X[rows], U[rows], None, ()).step_cost, whole[rows])
+    assert bool((torch.isfinite(whole) & (whole > 0)).all())
 
 
 def test_costates_in_c_say_what_steps_cost() -> None:

@@ -10,7 +10,7 @@ from tests.native.test_engine import BRIEF, PRINTED, running_state
 from tests.problems import boxed_batch, planar_batch
 from torchgco import MPPI, Problem
 from torchgco.base.draws import DrawKey
-from torchgco.kernels import EagerWarning, cost_unit, kernels_of
+from torchgco.kernels import EagerWarning, cost_scale, kernels_of
 from torchgco.roadmap.geometry import scene_of
 from torchgco.roadmap.roadmap import Roadmap
 from torchgco.solvers.ending import optimality
@@ -28,7 +28,7 @@ def call_all(problem: Problem) -> None:
         kernels_of(problem).descend(lagrangian, state, inner.descent, 4)
     key = DrawKey(7, torch.arange(B), torch.arange(B))
     SAMPLER.improve(problem, state.U, key)
-    cost_unit(problem)
+    cost_scale(problem)
     scene = scene_of(problem, problem.cost.rest_controls(torch.zeros_like(state.U)))
     if scene is not None:
         Roadmap(num_halton=12).paths(scene, 3)

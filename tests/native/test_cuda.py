@@ -200,7 +200,9 @@ def test_structures_on_a_device_point_to_what_lies_there() -> None:
     both, given = torch.zeros(4, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
     lam = torch.zeros(2, dtype=torch.float64)
     rows = [Constraint(rows=1), Constraint(rows=2, lam=lam, bound=Array(data=given, size=3))]
-    packed = Packed(N=5, constraints=2, constraint=rows, X=both[:2], U=both[2:], mu=both).copy({"limit": 7})
+    packed = Packed(N=5, constraints=2, constraint=rows, X=both[:2], U=both[2:], mu=both).fill(
+        {"limit": 7}, copied=True
+    )
     placed = launch.Placed(packed, torch.device("cpu"))
     there = Packed.from_address(placed.address)
     assert (there.N, there.limit, there.constraints) == (5, 7, 2)

@@ -23,7 +23,7 @@ from tests.slow import mostly
 from torchgco import InputError, Problem, Status, kernels
 from torchgco.constraints.base import Constraint
 from torchgco.ilqr.step import lifted_search
-from torchgco.kernels import EagerWarning, cost_unit, kernels_of
+from torchgco.kernels import EagerWarning, cost_scale, kernels_of
 from torchgco.native.compiler import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
@@ -72,7 +72,7 @@ def test_value_expansion_and_iterations_are_pytorchs(name: str, unit: bool) -> N
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_unit_of_cost_is_pytorchs(name: str) -> None:
     problem, same = PROBLEMS[name](), PROBLEMS[name]()
-    torch.testing.assert_close(cost_unit(problem), same.cost_unit, rtol=1e-12, atol=0)
+    torch.testing.assert_close(cost_scale(problem).unit, same.cost_unit, rtol=1e-12, atol=0)
 
 
 def test_at_rest_kinks_have_pytorchs_derivatives() -> None:

@@ -31,7 +31,7 @@ def recording() -> Iterator[None]:
 
 def not_recording() -> AbstractContextManager[None]:
     """Nothing is recorded, neither for backward passes nor of tensors in forward mode."""
-    return _without_tangents() if is_forward() else torch.no_grad()
+    return _without_tangents() if forward_ad._current_level >= 0 else torch.no_grad()
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def is_forward() -> bool:
 
 def asks(tensor: Tensor) -> bool:
     """Whether a tensor asks for gradients, or has a tangent of forward mode."""
-    return tensor.requires_grad or (is_forward() and _has_tangent(tensor))
+    return tensor.requires_grad or (forward_ad._current_level >= 0 and _has_tangent(tensor))
 
 
 def _has_tangent(tensor: Tensor) -> bool:

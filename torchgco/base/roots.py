@@ -54,16 +54,13 @@ def root(residual: Callable[[Tensor], Tensor], guess: Tensor) -> Tensor:
         return around.root_within(residual, guess)
     equation = _Equation(residual, guess)
     z = _newton(equation, equation.guess)
-    if _is_differentiated(equation(z)):
+    value = equation(z)
+    if is_functorch_wrapped_tensor(value) or asks(value):
         inverse = torch.linalg.inv_ex(_slopes(equation, z))[0]
         # A step of Newton's method with a constant inverse brings one more derivative each.
         for _ in range(2):
             z = z - _times(inverse, equation(z))
     return z[..., : guess.shape[-1]]
-
-
-def _is_differentiated(value: Tensor) -> bool:
-    return is_functorch_wrapped_tensor(value) or asks(value)
 
 
 class _Equation:

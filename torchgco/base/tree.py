@@ -28,7 +28,10 @@ class PerElement(Brief):
 
     def take(self, index: Rows) -> Self:
         """The same part for the problems in `index` (int64, (B',), or a slice)."""
-        changes = taken(self, self.batched, index)
+        changes = dict[str, Any]()
+        for name in self.batched:
+            value = getattr(self, name)
+            changes[name] = value[index] if type(value) is Tensor else None if value is None else take(value, index)
         for name in self.per_element:
             value = getattr(self, name)
             if isinstance(value, Tensor) and value.dim() > 0 and value.shape[0] != 1:
@@ -46,33 +49,28 @@ def is_users(part: object) -> bool:
     return getattr(part, "calls_function", False) or type(part).__module__.partition(".")[0] != "torchgco"
 
 
-def is_whole(index: Rows, B: int) -> bool:
-    """Whether an index takes all B problems in their order."""
-    if isinstance(index, slice):
-        return index.indices(B) == (0, B, 1)
-    return index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
-
-
 def take(tree: Any, index: Rows) -> Any:
-    """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged."""
+    """Rows `index` of every tensor in nested tuples and dataclasses; None and plain values pass unchanged.
+
+    Most parts are tensors, and each solve takes thousands: no call for these.
+    """
     if isinstance(tree, Tensor):
         return tree[index]
     if isinstance(tree, PerElement):
         return tree.take(index)
     if isinstance(tree, tuple):
-        rows = [leaf[index] if type(leaf) is Tensor else take(leaf, index) for leaf in tree]
+        rows: list[Any] = [
+            leaf[index] if type(leaf) is Tensor else None if leaf is None else take(leaf, index) for leaf in tree
+        ]
         return type(tree)(*rows) if hasattr(tree, "_fields") else tuple(rows)
-    names = field_names(type(tree))
-    return _made(type(tree), taken(tree, names, index)) if names else tree
-
-
-def taken(tree: Any, names: tuple[str, ...], index: Rows) -> dict[str, Any]:
-    """Rows `index` of these attributes. Most are tensors, and each solve takes thousands: no call for these."""
-    parts = ((name, getattr(tree, name)) for name in names)
-    return {
-        name: part[index] if type(part) is Tensor else None if part is None else take(part, index)
-        for name, part in parts
-    }
+    if not (names := field_names(type(tree))):
+        return tree
+    made = object.__new__(type(tree))  # its parts are checked and bound already
+    for name in names:
+        part = getattr(tree, name)
+        taken = part[index] if type(part) is Tensor else None if part is None else take(part, index)
+        object.__setattr__(made, name, taken)
+    return made
 
 
 def changed(part: Any, changes: Mapping[str, Any]) -> Any:
@@ -183,8 +181,11 @@ def copied(tree: Any) -> Any:
         return tuple([leaf.clone() if type(leaf) is Tensor else copied(leaf) for leaf in tree])
     if not (names := field_names(type(tree))):
         return tree
-    parts = ((name, getattr(tree, name)) for name in names)
-    return _made(type(tree), {name: part.clone() if type(part) is Tensor else copied(part) for name, part in parts})
+    made = object.__new__(type(tree))
+    for name in names:
+        part = getattr(tree, name)
+        object.__setattr__(made, name, part.clone() if type(part) is Tensor else None if part is None else copied(part))
+    return made
 
 
 def spread(values: Tensor, rows: Tensor) -> Tensor:

@@ -38,8 +38,8 @@ class Values(PerElement):
 
         `k` is the knot, or the knots (K,) of the second axis; it is passed on where the function asks for it.
         """
-        taken, x = keywords(function), arguments[0]
-        more: dict[str, Any] = {"k": k} if k is not None and asks_for_knot(function) else {}
+        (taken, asks_for_knot), x = taken_by(function), arguments[0]
+        more: dict[str, Any] = {"k": k} if k is not None and asks_for_knot else {}
         for name, value in zip(self.names, self.rows, strict=True):
             if name in taken:
                 more[name] = value[(slice(None), *[None] * (x.dim() - 2))]
@@ -138,7 +138,7 @@ def bound_values(
                 value = value.expand(dims.B, *value.shape[1:])
             if tuple(value.shape[: len(shape)]) != shape:
                 raise InputError(where, f"shape ({', '.join(map(str, shape))}, ...)", tuple(value.shape))
-            if not any(name in keywords(function) for function in functions if function is not None):
+            if not any(name in taken_by(function).names for function in functions if function is not None):
                 raise InputError(where, "the name of an argument of the function", "a name that it doesn't take")
             by_kind[kind][name] = value
     rows, at_knots = by_kind["values"], by_kind["knot_values"]
@@ -163,24 +163,18 @@ class _All(frozenset):
         return True
 
 
-def keywords(function: Callable[..., Any]) -> frozenset[str]:
-    """The arguments that a function takes by name; all of them where it takes **anything."""
-    return _taken(function).names
+class Taken(NamedTuple):
+    """What a function takes by name: all where it takes **anything; and whether it has an argument k without a default.
 
-
-def asks_for_knot(function: Callable[..., Any]) -> bool:
-    """Whether a function has an argument k without a default; with one, k is a constant of the user's."""
-    return _taken(function).knot
-
-
-class _Taken(NamedTuple):
-    """What a function takes by name, and whether it asks for a knot k."""
+    With a default, k is a constant of the user's.
+    """
 
     names: frozenset[str]
     knot: bool
 
 
-def _taken(function: Callable[..., Any]) -> _Taken:
+def taken_by(function: Callable[..., Any]) -> Taken:
+    """What a function takes."""
     with suppress(KeyError, TypeError):  # not seen before, or it can't be a key
         return _known[function]
     called = function.forward if isinstance(function, torch.nn.Module) else function
@@ -191,11 +185,11 @@ def _taken(function: Callable[..., Any]) -> _Taken:
     named = [p for p in parameters if p.kind in NAMED_PARAMETERS]
     every = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters)
     names = _All() if every else frozenset(p.name for p in named)
-    taken = _Taken(names, any(p.name == "k" and p.default is p.empty for p in named))
+    taken = Taken(names, any(p.name == "k" and p.default is p.empty for p in named))
     with suppress(TypeError):
         _known[function] = taken
     return taken
 
 
 # A rollout by PyTorch's kernels asks at every knot; what a function captures must not outlive it for that.
-_known: WeakKeyDictionary[Callable[..., Any], _Taken] = WeakKeyDictionary()
+_known: WeakKeyDictionary[Callable[..., Any], Taken] = WeakKeyDictionary()

@@ -100,7 +100,8 @@ def transcribe(problem: Problem) -> Program:
     x, u = [ca.SX.sym(f"x{k}", n) for k in range(N + 1)], [ca.SX.sym(f"u{k}", m) for k in range(N)]
     X, U = np.stack([elements(z) for z in x])[None], np.stack([elements(z) for z in u])[None]
     ahead, calls = _ahead(problem, step, symbols[0], X, U)
-    variables = ca.vertcat(*(ca.vertcat(*z) for z in zip(x, u, map(_unknowns, calls), strict=False)), x[-1])
+    unknowns = [ca.vertcat(ca.SX(0, 1), *(root.outputs for root in roots)) for roots in calls]
+    variables = ca.vertcat(*(ca.vertcat(*z) for z in zip(x, u, unknowns, strict=False)), x[-1])
 
     at_knot: list[list[tuple[ca.SX, bool]]] = [[] for _ in range(N + 1)]  # rows, and whether each is an equality
     free = _free(problem)
@@ -170,10 +171,6 @@ def _ahead(
     first = [_column(z[0, 0]) for z in (X, U)]
     single = ca.Function("step", [*first, p], [_column(step(elements(p), X[:, 0], U[:, 0])[0])])
     return [single(_column(x), _column(u), p) for x, u in zip(X[0], U[0], strict=False)], none
-
-
-def _unknowns(roots: list[Call]) -> ca.SX:
-    return ca.vertcat(ca.SX(0, 1), *(root.outputs for root in roots))
 
 
 def _limits(

@@ -34,7 +34,7 @@ from torchgco.compiled.numbers import (
     with_own_numbers,
 )
 from torchgco.explaining.explain import Account
-from torchgco.kernels import cost_unit, held_on_cpu, is_mixed, served_by
+from torchgco.kernels import cost_scale, held_on_cpu, is_mixed, served_by
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.quality import violation
 from torchgco.native.engine import Engine
@@ -122,7 +122,7 @@ class Compiled:
         if kept is not None:
             lifted = isinstance(kept, KeptCarried)
             self._problem = problem if lifted else kept.problem
-            self._unit = cost_unit(kept.whole if lifted else kept.problem)
+            self._unit = cost_scale(kept.whole if lifted else kept.problem).unit
 
     def __call__(
         self,

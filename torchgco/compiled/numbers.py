@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Floats, Number, Wrong, above_zero, at_least_zero, numbers, numbers_of_fields
 from torchgco.base.tree import own_mapped
-from torchgco.kernels import cost_scale, cost_unit, current, interior_of
+from torchgco.kernels import cost_scale, current, interior_of
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.native.interior import InteriorEngine, Kept
@@ -246,7 +246,7 @@ class KeptInTime(KeptCarried):
     """
 
     def __init__(self, kernels: InteriorEngine, user: Problem, whole: Problem, options: BarrierOptions) -> None:
-        self.unit = cost_unit(whole)
+        self.unit = cost_scale(whole).unit
         super().__init__(kernels, user, whole, options)
         self._copied_in["time"] = ["cost", *range(len(user.constraints), len(whole.constraints))]
 

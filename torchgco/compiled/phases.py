@@ -23,7 +23,7 @@ from torchgco.compiled.numbers import (
     with_numbers_as_they_are,
     with_own_numbers,
 )
-from torchgco.kernels import cost_scale, cost_unit, current, interior_of
+from torchgco.kernels import cost_scale, current, interior_of
 from torchgco.lagrangian.barrier import BarrierOptions
 from torchgco.lagrangian.quality import violation
 from torchgco.native.interior import InteriorEngine
@@ -161,7 +161,7 @@ class CompiledPhases(Compiled):
             return
         kernels = interior_of(form)
         if isinstance(kernels, InteriorEngine) and not kernels.engine.captured.reads_own:
-            self._unit = cost_unit(form)
+            self._unit = cost_scale(form).unit
             self._kept = KeptPhases(kernels, form, phases, self.interior.options(warm=True))
 
     def _moved(self, shift: Any, elapsed: Any) -> float:

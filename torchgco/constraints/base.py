@@ -17,7 +17,7 @@ from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions
 from torchgco.base.tree import PerElement, is_users, passed_on
-from torchgco.base.values import asks_for_knot, bound_values
+from torchgco.base.values import bound_values, taken_by
 from torchgco.constraints.carried import Carried
 from torchgco.costs.base import add_first, add_slopes
 
@@ -417,7 +417,7 @@ class FunctionConstraint(Constraint):
         stands = (counts > 0) & (knots == N) & (horizon < N).unsqueeze(-1)
         if not bool(stands.any()):
             return CountedRows(self, counts)
-        if asks_for_knot(self.function):
+        if taken_by(self.function).knot:
             expected = "a function without an argument k at the last knots: `knot_values` serve"
             raise InputError("horizon", expected, f"one with it in {where}")
         return CountedRows(replace(self, values=self.values.ending_at(horizon)), counts)
@@ -425,7 +425,7 @@ class FunctionConstraint(Constraint):
     @property
     def reads_knots(self) -> bool:
         """Whether the function takes the number of the knot, or values of it."""
-        return bool(self.values.knot_names) or asks_for_knot(self.function)
+        return bool(self.values.knot_names) or taken_by(self.function).knot
 
     def value(self, X: Tensor, U: Tensor) -> Tensor:
         return self._along(X)(*self._arguments(X, U))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import check_options
 from torchgco.base.shapes import Dimensions, check_finite, per_row
-from torchgco.base.values import Values, asks_for_knot, bound_values
+from torchgco.base.values import Values, bound_values, taken_by
 from torchgco.constraints.base import Constraint, FunctionConstraint, Sense, whole
 from torchgco.constraints.carried import Carried, Carrying, Taken
 from torchgco.dynamics.base import INTEGRATORS
@@ -271,7 +271,7 @@ class Summed(Carrying):
     batched: ClassVar[tuple[str, ...]] = ("values", "running")
 
     by_stage = property(  # type: ignore[assignment]
-        lambda self: self.running is not None or asks_for_knot(self.function)
+        lambda self: self.running is not None or taken_by(self.function).knot
     )
 
     def __len__(self) -> int:

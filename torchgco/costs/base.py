@@ -15,7 +15,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.numbers import Number, numbers_of_fields
 from torchgco.base.shapes import Dimensions, lead
 from torchgco.base.tree import PerElement, is_users, passed_on
-from torchgco.base.values import asks_for_knot, bound_values, whole_numbers_become
+from torchgco.base.values import bound_values, taken_by, whole_numbers_become
 
 
 class Cost(PerElement):
@@ -283,7 +283,7 @@ class FunctionCost(Cost):
     @property
     def reads_knots(self) -> bool:
         """Whether the cost of a stage takes its number, or values of it."""
-        return bool(self.values.knot_names) or asks_for_knot(self.stage_function)
+        return bool(self.values.knot_names) or taken_by(self.stage_function).knot
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         return self.values.call(self.stage_function, x, u, k=k)

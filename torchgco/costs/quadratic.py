@@ -283,8 +283,9 @@ class BoundQuadratic(Cost):
 
     def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
         parts: Sequence[Any] = self.x_ref, self.u_ref, self.Q, self.R, self.q, self.r, self.H
-        if isinstance(k, int):
-            parts = [part if part is None else _at(part, k, x.dim()) for part in parts]
+        if isinstance(k, int):  # samples follow the batch axis
+            parts = [None if part is None else part[:, min(k, part.shape[1] - 1)] for part in parts]
+            parts = [None if part is None else part.unsqueeze(1) for part in parts] if x.dim() == 3 else parts
         x_ref, u_ref, Q, R, q, r, H = parts
         ex, eu = x - x_ref, u - u_ref
         if self.diagonal:
@@ -349,14 +350,6 @@ class BoundQuadratic(Cost):
         if W.requires_grad and e.dim() == 3 and W.dim() == 4 and W.shape[1] == 1:
             return torch.bmm(e, W[:, 0].mT.expand(len(e), *W.shape[2:]))  # products of all knots would be kept
         return W * e if self.diagonal else (W * e.unsqueeze(-2)).sum(-1)
-
-
-def _at(values: Tensor, k: int, axes: int) -> Tensor:
-    """Values (B|1, N|1, ...) of stage k for states of so many axes: that of samples follows the batch axis."""
-    if axes == 3 and values.shape[1] == 1:
-        return values
-    index = k if values.shape[1] > 1 else 0
-    return values[:, index] if axes == 2 else values[:, index : index + 1]
 
 
 def _weight(value: Any, field: str, size: int, B: int, N: int | None, like: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from torchgco.base.options import Checked, Count, Natural, Seconds
 from torchgco.base.roots import root
 from torchgco.base.shapes import Dimensions, repeated
 from torchgco.base.tree import PerElement, is_users, passed_on
-from torchgco.base.values import NO_VALUES, Knot, Values, asks_for_knot, bound_values
+from torchgco.base.values import NO_VALUES, Knot, Values, bound_values, taken_by
 
 Rates = Callable[[Tensor], Tensor]
 Integrator = Literal["euler", "midpoint", "rk4", "implicit_euler", "radau3", "radau5"]
@@ -243,7 +243,7 @@ class FunctionDynamics(Dynamics, named="dynamics"):
 
     @property
     def _depends_on_stage(self) -> bool:
-        return asks_for_knot(self.function) or (isinstance(self.values, Values) and bool(self.values.knot_names))
+        return taken_by(self.function).knot or (isinstance(self.values, Values) and bool(self.values.knot_names))
 
     @property
     def is_integrated(self) -> bool:

@@ -45,7 +45,8 @@ class Planar(Dynamics, named="planar"):
     def field(self, x: Tensor, u: Tensor) -> Tensor:
         _, _, theta, vx, vy, turning = components(x)
         left, right = components(u)
-        k1, k2, k3, k4 = (lead(k, theta) for k in (self.drag, self.thrust_gain, self.turn_drag, self.turn_gain))
+        given = self.drag, self.thrust_gain, self.turn_drag, self.turn_gain
+        k1, k2, k3, k4 = (lead(k, theta) if isinstance(k, Tensor) else k for k in given)
         push = k2 * (left + right)
         return vectors(
             vx,

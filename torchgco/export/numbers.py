@@ -143,8 +143,9 @@ def _ways(
         at += view[0].size
     if set(places) <= set(arrays):
         return places, {}
-    if number.name.rpartition(".")[2] in (RADII, RADIUS) and _is_of_spheres(kept, number):
-        return {}, {}  # see _add_radii
+    part = kept.problem.constraints[number.part] if isinstance(number.part, int) else None
+    if number.name.rpartition(".")[2] in (RADII, RADIUS) and part is not None and part.kernel == "spheres":
+        return {}, {}  # C reads squares of inflated radii: see _add_radii
     copies = _probed(kept, compiled, number, first)
     return None if copies is None else ({}, copies)
 
@@ -192,11 +193,6 @@ def _write(kept: Kept, compiled: Compiled, number: Number, values: np.ndarray) -
             kept.refresh_cost()
         elif isinstance(part, int):
             kept.refresh_constraint(part)
-
-
-def _is_of_spheres(kept: Kept, number: Number) -> bool:
-    """Whether C reads squares of inflated radii of the obstacles whose number it is."""
-    return isinstance(number.part, int) and kept.problem.constraints[number.part].kernel == "spheres"
 
 
 def _add_radii(kept: Kept, members: list[Member], copied: dict[int, Copies]) -> None:

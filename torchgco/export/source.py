@@ -140,8 +140,8 @@ def _count(kept: Kept) -> int:
     """How many numbers a solve needs room for beside those of its problem."""
     function = kept.library.tgco_room
     function.restype = ctypes.c_int64
-    alone = kept.packed.copy({"arena": 1})
-    return int(function(ctypes.byref(kept.how.copy({"of": alone}))))
+    alone = kept.packed.fill({"arena": 1}, copied=True)
+    return int(function(ctypes.byref(kept.how.fill({"of": alone}, copied=True))))
 
 
 def structure_numbers(K: int) -> int:

@@ -104,7 +104,8 @@ def _least(fleet: Fleet, X: Sequence[Tensor], U: Sequence[Tensor]) -> Tensor:
         fine = p[rows]
         if count > 1:
             members, x, u = [one.take(rows) for one in fleet.members], [x[rows] for x in X], [u[rows] for u in U]
-            inner = _places_within(fleet, members, x, u, count).unflatten(2, (fleet.N, count - 1))
+            inner = fleet.places([_within(*one, count) for one in zip(members, x, u, strict=True)])
+            inner = inner.unflatten(2, (fleet.N, count - 1))
             ahead = torch.cat((fine[:, :, :-1].unsqueeze(3), inner), dim=3).flatten(2, 3)
             fine = torch.cat((ahead, fine[:, :, -1:]), dim=2)
         for b, way in zip(rows.tolist(), fine, strict=True):  # one fleet at a time: bounds the memory
@@ -117,12 +118,6 @@ def leaves_chords(one: Problem, X: Tensor, U: Tensor) -> Tensor:
     """By how much the positions of a vehicle leave their chords halfway between knots, (B,), m."""
     p, middle = X[..., one.position], _within(one, X, U, 2)[..., one.position]
     return (middle - 0.5 * (p[:, :-1] + p[:, 1:])).norm(dim=-1).amax(-1)
-
-
-def _places_within(
-    fleet: Fleet, members: Sequence[Problem], X: Sequence[Tensor], U: Sequence[Tensor], count: int
-) -> Tensor:
-    return fleet.places([_within(one, x, u, count) for one, x, u in zip(members, X, U, strict=True)])
 
 
 def _within(one: Problem, X: Tensor, U: Tensor, count: int) -> Tensor:

@@ -20,7 +20,7 @@ from torchgco.base.options import AtLeast, Checked, Positive
 from torchgco.base.shapes import repeated
 from torchgco.base.tree import put, take
 from torchgco.guidance.mppi import MPPI
-from torchgco.kernels import cost_unit, kernels_of
+from torchgco.kernels import cost_scale, kernels_of
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.problem import Problem
 from torchgco.solvers.caught import active_counts, caught_knots
@@ -160,7 +160,7 @@ class GCO(Checked, named="gco"):
             subset = problem.take(rows)
             mean = problem.cost.rest_controls(U)[rows] if self.sample_from_rest else U[rows]
             X_safe, plan[rows] = self.sampler.improve(subset, mean, key.take(rows))
-            holds = subset.cost.total(X_safe, plan[rows]).abs() <= DIVERGED * subset.N * cost_unit(subset)
+            holds = subset.cost.total(X_safe, plan[rows]).abs() <= DIVERGED * subset.N * cost_scale(subset).unit
             if self.start_from_sample:
                 taken[rows] = ~active_counts(subset, X_safe, plan[rows]).any(-1) & holds
             near = torch.where(knots[rows] & holds.unsqueeze(-1), _radius(problem, X)[rows].unsqueeze(-1), torch.inf)

@@ -28,7 +28,7 @@ from torchgco.problem.alone import row_by_row
 from torchgco.problem.horizons import within_horizons
 from torchgco.problem.in_time import at_times, factor_controls
 from torchgco.problem.problem import Problem, current_problem
-from torchgco.problem.times import Paths, bends, paths
+from torchgco.problem.times import Paths, paths
 
 HARDLY_SEEN = 1e-6  # share of the cost that a control is held to change over its range at least
 LITTLE = 1e-3  # share of a control's size: by as much as its slopes change over that, they count at least
@@ -166,7 +166,7 @@ def _clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 def _bulge(distance: Distance, problem: Problem, path: Paths, U: Tensor, k: Tensor) -> Tensor:
     """How far a part's places may leave their chord of each piece, of stages k by controls U, (N|1, P|1), m: along a
     known field, else where the states change evenly."""
-    if not bends(problem):
+    if not problem.bends:
         return distance.even_bulge(path.X)[0]
     dynamics, X, dt = problem.dynamics.at(k), path.X, problem.dynamics.dt / path.pieces
     field = lambda x: dynamics.field(x, U)

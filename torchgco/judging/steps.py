@@ -14,13 +14,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import is_users, take
-from torchgco.dynamics.base import INTEGRATORS
+from torchgco.dynamics.base import INTEGRATORS, Dynamics
 from torchgco.problem.horizons import at_rest_after, within_horizons
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
@@ -123,7 +124,8 @@ def step_errors(
                 lams = None if multipliers is None else tuple(lam[numbers] for lam in multipliers)
                 t = None if times is None else times[numbers]
                 part = _Differences(problem.take(numbers), X[numbers], U[numbers], e[chosen], t, lams)
-                part = replace(part, slopes=None if costates is None else part.found_by(costates))
+                if costates is not None:
+                    part = replace(part, slopes=costates(part.problem, part.X, part.U, lams or ()))
                 costs[chosen] = part.cost(total[chosen], too_much[numbers] if doubted else None)
             error.step_cost[rows] = costs
         large = error.step_error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR)
@@ -149,9 +151,8 @@ def _in_parts(B: int, numbers: int) -> Iterator[slice]:
     return (slice(i, min(i + rows, B)) for i in range(0, B, rows))
 
 
-def _two_halves(problem: Problem, x: Tensor, U: Tensor, times: Tensor | None) -> Tensor:
-    """The states (B, N, n) after two steps of half the length from x (B, N, n)."""
-    model = problem.along
+def _two_halves(model: Dynamics, x: Tensor, U: Tensor, times: Tensor | None) -> Tensor:
+    """The states (B, N, n) after two steps of half the length from x (B, N, n), by the model of all stages."""
     as_it_is = lambda z: z
     ahead = as_it_is if times is None and model.is_integrated else model.settled
     if times is None:
@@ -169,7 +170,7 @@ def _along(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> tupl
 
     0 after a problem's own last stage. Infinite shares where Newton's method ends the whole step, and not the halves.
     """
-    e = X[:, 1:] - _two_halves(problem, X[:, :-1], U, times)
+    e = X[:, 1:] - _two_halves(problem.along, X[:, :-1], U, times)
     e = e if problem.horizon is None else torch.where(problem.running.unsqueeze(-1), e, 0.0)
     size, apart = X.abs().amax(1, keepdim=True), e.abs()
     apart = torch.where(e.isnan() & torch.isfinite(X[:, 1:] - X[:, :-1]), torch.inf, apart)
@@ -180,8 +181,17 @@ def _along(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> tupl
 
 def first_order_cost(problem: Problem, X: Tensor, U: Tensor, e: Tensor, slopes: Tensor) -> Tensor:
     """`StepErrors.step_cost` (B,) to first order, of differences e (B, N, n) and costates (B, N+1, n)."""
-    change = (slopes[:, 1:, : e.shape[-1]] * e).flatten(1).sum(-1).abs()
-    return torch.where(change != 0, change / _size(problem, X, U), 0.0)
+    return _shares(_of_first_order(e, slopes), _size(problem, X, U))
+
+
+def _of_first_order(e: Tensor, slopes: Tensor) -> Tensor:
+    """By how much differences e (B, N, n) change the cost by costates (B, N+1, n), (B,)."""
+    return (slopes[:, 1:, : e.shape[-1]] * e).flatten(1).sum(-1).abs()
+
+
+def _shares(change: Tensor, size: Tensor) -> Tensor:
+    """Changes of costs as shares of their sizes, (B,); 0 where there is none."""
+    return torch.where(change != 0, change / size, 0.0)
 
 
 def costates_of(problem: Problem, X: Tensor, U: Tensor, multipliers: Sequence[Tensor]) -> Tensor:
@@ -192,7 +202,7 @@ def costates_of(problem: Problem, X: Tensor, U: Tensor, multipliers: Sequence[Te
     """
     by_x, (B, N, n) = _slopes(problem, X, U, None, multipliers)[0], X[:, 1:].shape
     each = torch.arange(B, device=X.device).repeat_interleave(n)
-    twins, u = problem.take(each).along, U[each]
+    twins, u = problem.along.take(each), U[each]
     rows = lambda x: twins.step(x, u).view(B, n, N, n).diagonal(dim1=1, dim2=3)
     fx = gradients_at_once(rows, X[each, :-1])[0].view(B, n, N, n)
     costates = [by_x[:, -1]]
@@ -213,12 +223,11 @@ class _Differences:
     multipliers: tuple[Tensor, ...] | None  # None: controls don't answer
     slopes: Tensor | None = None  # (B, N+1, n), of the cost by the states, where later states follow
 
-    def found_by(self, costates: Costates) -> Tensor | None:
-        return costates(self.problem, self.X, self.U, self.multipliers or ())
-
     def take(self, rows: Tensor) -> _Differences:
+        if (problem := self.problem.take(rows)) is self.problem:
+            return self
         tensors = self.X, self.U, self.e, self.times, self.multipliers, self.slopes
-        return _Differences(self.problem.take(rows), *take(tensors, rows))
+        return _Differences(problem, *take(tensors, rows))
 
     def cost(self, shares: Tensor, too_much: Tensor | None) -> Tensor:
         """`StepErrors.step_cost` (B,), of first order alone where both orders are far below too_much (B,).
@@ -226,16 +235,17 @@ class _Differences:
         Args:
             shares: sums over all stages, (B,).
         """
+        size = _size(*at_times(within_horizons(self.problem), self.X, at_rest_after(self.problem, self.U), self.times))
         if self.slopes is None or too_much is None:
-            return self.of_both_orders()
-        whole = at_times(within_horizons(self.problem), self.X, at_rest_after(self.problem, self.U), self.times)
-        costs = first_order_cost(*whole, self.e, self.slopes)
+            return self.of_both_orders(size)
+        costs = _shares(_of_first_order(self.e, self.slopes), size)
         doubts = (~((costs < FAR * too_much) & (shares.square() < FAR * too_much))).nonzero().flatten()
         if doubts.numel() > 0:
-            costs[doubts] = self.take(doubts).of_both_orders()
+            costs[doubts] = self.take(doubts).of_both_orders(size[doubts])
         return costs
 
-    def of_both_orders(self) -> Tensor:
+    def of_both_orders(self, size: Tensor) -> Tensor:
+        """`StepErrors.step_cost` (B,), of costs of this `_size` (B,)."""
         problem, n = self.problem, self.problem.n
         held, U = within_horizons(problem), at_rest_after(problem, self.U)
         whole = at_times(held, self.X, U, self.times)
@@ -251,7 +261,7 @@ class _Differences:
         H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
         first, second = _answered(F, H, self.multipliers is not None)
         change = first.abs() + second.clamp(min=0.0) / (1.0 - 0.5 ** ORDER_OF[problem.dynamics.integrator])
-        return torch.where(change != 0, change / _size(*whole), 0.0)
+        return _shares(change, size)
 
 
 def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
@@ -263,18 +273,34 @@ def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
     Args:
         F: of two halves, (B, N, n+2, s); H: slopes and curvatures, (B, N+1, s, s).
     """
-    z, n = F.shape[2], F.shape[2] - 2
-    V, rows, steps = H[:, -1, :z, :z], H.unbind(1), F.unbind(1)
-    for k in range(len(steps) - 1, -1, -1):
-        Q = torch.baddbmm(rows[k], steps[k].mT, V @ steps[k])
-        V = Q[:, :z, :z]
-        if feedback:
-            L, failed = torch.linalg.cholesky_ex(Q[:, z:, z:])
-            K = Q.new_zeros(*Q.shape[:1], Q.shape[1] - z, z)
-            K[:, :, :n] = torch.where(failed.view(-1, 1, 1) == 0, -torch.cholesky_solve(Q[:, z:, :n], L), 0.0)
-            answer = K.mT @ torch.baddbmm(Q[:, z:, :z], Q[:, z:, z:], K, alpha=0.5)
-            V = V + answer + answer.mT
+    (B, N, z, s), n = F.shape, F.shape[2] - 2
+    # In NumPy, as an operation of PyTorch on a few small matrices takes several times as long.
+    steps, rows = (np.ascontiguousarray(blocks.transpose(0, 1).cpu().numpy()) for blocks in (F, H))
+    V, whole = rows[-1, :, :z, :z], np.zeros((B, s, z), rows.dtype)
+    whole[:, :z] = np.eye(z)  # [z, u] from z
+    turned, back = np.ascontiguousarray(steps.swapaxes(2, 3)), whole.swapaxes(1, 2)
+    with np.errstate(all="ignore"):
+        for k in range(N - 1, -1, -1):
+            Q = rows[k] + turned[k] @ (V @ steps[k])
+            if feedback:
+                S, right = Q[:, z:, z:], -Q[:, z:, :n]
+                try:
+                    np.linalg.cholesky(S)
+                    whole[:, z:, :n] = np.linalg.solve(S, right)
+                except np.linalg.LinAlgError:
+                    whole[:, z:, :n] = [_solution(*of_each) for of_each in zip(S, right, strict=True)]
+            V = back @ (Q @ whole)
+    V = torch.from_numpy(V).to(F.device)
     return V[:, n, n + 1], 0.5 * V[:, n + 1, n + 1]
+
+
+def _solution(S: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """S^-1 right (m, n), the same bits as in a batch; 0 where S isn't positive definite."""
+    try:
+        np.linalg.cholesky(S)
+        return np.linalg.solve(S, right)
+    except np.linalg.LinAlgError:
+        return np.zeros_like(right)
 
 
 def _slopes(
@@ -296,7 +322,7 @@ def _half_steps(problem: Problem, x: Tensor, U: Tensor, e: Tensor, times: Tensor
     """F (B, N, n+2, s) with [dx_{k+1}, 1, t] = F_k [dx_k, 1, t, du_k] of two halves that lead t e_k elsewhere."""
     (B, N, n), m = x.shape, U.shape[-1]
     each = torch.arange(B, device=x.device).repeat_interleave(n)
-    twins, t = problem.take(each), None if times is None else times[each]
+    twins, t = problem.along.take(each), None if times is None else times[each]
     rows = lambda x, u: _two_halves(twins, x, u, t).view(B, n, N, n).diagonal(dim1=1, dim2=3)
     by_x, by_u = (z.view(B, n, N, -1).transpose(1, 2) for z in gradients_at_once(rows, x[each], U[each]))
     if problem.horizon is not None:
@@ -311,8 +337,8 @@ def _half_steps(problem: Problem, x: Tensor, U: Tensor, e: Tensor, times: Tensor
 def _curvatures(problem: Problem, whole: Problem, X: Tensor, U: Tensor, multipliers: Sequence[Tensor] | None) -> Tensor:
     """H (B, N+1, s, s) of the cost, and by the controls of rows that bind as a barrier has it: multiplier / slack.
 
-    It holds controls at their bounds. Rows of states push to first order alone: what a barrier's curvature adds is no
-    cost. Rows of several knots have none.
+    It holds controls at their bounds. Rows of states, as those of obstacles, push to first order alone: what a
+    barrier's curvature adds is no cost. Rows of several knots have none.
     """
     n, m, size = problem.n, problem.m, whole.n + 1 + whole.m
     blocks = X.new_empty(*X.shape[:2], size, size)
@@ -322,7 +348,7 @@ def _curvatures(problem: Problem, whole: Problem, X: Tensor, U: Tensor, multipli
     H[:, :, :n, :n], H[:, :, mine, mine] = blocks[:, :, :n, :n], blocks[:, :, theirs, theirs]
     H[:, :, mine, :n], H[:, :, :n, mine] = blocks[:, :, theirs, :n], blocks[:, :, :n, theirs]
     for row, lam in zip(whole.constraints, multipliers or (), strict=False):
-        if not row.joins_knots and bool(lam.any()):
+        if not row.joins_knots and not row.geometric and bool(lam.any()):
             stiff = torch.where(lam != 0, lam.abs() / row.value(X, U).abs().clamp(min=LEAST_SLACK), 0.0)
             row.accumulate(X, U, torch.zeros_like(lam), stiff, blocks.zero_())
             H[:, :, mine, mine] += blocks[:, :, theirs, theirs]

@@ -22,7 +22,6 @@ from torchgco.kernels.choice import use_native as use_native
 from torchgco.kernels.choice import used as used
 from torchgco.kernels.verbs import chord_clearance as chord_clearance
 from torchgco.kernels.verbs import cost_scale as cost_scale
-from torchgco.kernels.verbs import cost_unit as cost_unit
 from torchgco.kernels.verbs import costates as costates
 from torchgco.kernels.verbs import followed as followed
 from torchgco.kernels.verbs import interior_of as interior_of

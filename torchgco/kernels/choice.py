@@ -20,7 +20,7 @@ from torchgco.base.gradients import is_forward, nodes
 from torchgco.base.memory import trim
 from torchgco.base.shapes import CPU, computing_on
 from torchgco.base.together import Together
-from torchgco.base.tree import PerElement, field_names, is_users, mapped
+from torchgco.base.tree import PerElement, field_names, mapped
 from torchgco.kernels.in_c import NativeKernels
 from torchgco.kernels.in_pytorch import Kernels
 from torchgco.native.codegen.knot import JoinedKnots
@@ -109,7 +109,7 @@ def _has_code(problem: Problem) -> bool:
     """Whether functions in the problem's parts, if any, do what they did when its kernels were made, and capture the
     same numbers."""
     known = problem.known
-    if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
+    if not problem.users:
         return True
     if known.code is None or not known.in_c:
         return False

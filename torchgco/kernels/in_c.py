@@ -17,9 +17,10 @@ from torchgco.ilqr.line_search import Rollouts, rungs_of
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.ilqr.step import Descent, keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
-from torchgco.kernels.outer import END_FLAGS, END_NUMBERS, NativeOuter, pass_end
+from torchgco.kernels.outer import NativeOuter, blank_end, pass_end
 from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
-from torchgco.native.engine import Engine, Sampler
+from torchgco.native.cuda.engine import current_device
+from torchgco.native.engine import OF_MODEL, OF_ROWS, WHOLE, Engine, Sampler, run
 from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_problem import KeptDescent
 from torchgco.native.structures import Options
@@ -46,24 +47,27 @@ class NativeKernels(Kernels):
     def __init__(self, engine: Engine, warn: Callable[[Exception], None]) -> None:
         self.engine, self._warn, self.affine = engine, warn, engine.model.affine
         self._samplers: dict[Hashable, Sampler] = {}
+        self._interiors: dict[Hashable, InteriorEngine] = {}
 
     def open_loop(self, problem: Problem, U: Tensor) -> Tensor:
         X = U.new_empty(problem.B, problem.N + 1, problem.n)
         X[:, 0] = problem.x0
-        self.engine.run("tgco_open_loop", problem.B, self.engine.rolled(problem, X=X, U=U.contiguous()))
+        packed = self.engine.packed(problem, OF_MODEL, X=X, U=U.contiguous())
+        run(self.engine.library.tgco_open_loop, problem.B, self.engine.lanes, packed)
         return X
 
     def closed_loop(self, problem: Problem, X: Tensor, U: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
         X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
         gains = torch.nn.functional.pad(K, (0, 1)).contiguous()
-        self.engine.run("tgco_closed_loop", problem.B, self.engine.rolled(problem, X=X, U=U, gains=gains))
+        packed = self.engine.packed(problem, OF_MODEL, X=X, U=U, gains=gains)
+        run(self.engine.library.tgco_closed_loop, problem.B, self.engine.lanes, packed)
         return X, U
 
     def value(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> tuple[Tensor, Tensor]:
         B = lagrangian.problem.B
         cost, merit = X.new_empty(B), X.new_empty(B)
         packed = self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), cost=cost, merit=merit)
-        self.engine.run("tgco_value", B, packed)
+        run(self.engine.library.tgco_value, B, self.engine.lanes, packed)
         return cost, merit
 
     def begun(self, lagrangian: Lagrangian, U: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -71,7 +75,7 @@ class NativeKernels(Kernels):
         X, cost, merit = U.new_empty(B, problem.N + 1, problem.n), U.new_empty(B), U.new_empty(B)
         X[:, 0] = problem.x0
         packed = self.engine.terms(lagrangian, X=X, U=U.contiguous(), cost=cost, merit=merit)
-        self.engine.run("tgco_begin", B, packed)
+        run(self.engine.library.tgco_begin, B, self.engine.lanes, packed)
         return X, cost, merit
 
     def scale(self, problem: Problem) -> None:
@@ -90,36 +94,36 @@ class NativeKernels(Kernels):
         slopes, H, none = X.new_empty(B, N + 1, size), X.new_empty(B, N + 1, size, size), X.new_zeros(B)
         values = {"X": X.contiguous(), "U": U.contiguous(), "cost": none, "merit": none}
         if lagrangian is None:
-            packed = self.engine.packed(problem, **values, mu=none, constraints=0)
+            packed = self.engine.packed(problem, WHOLE, **values, mu=none, constraints=0)
         else:
             packed = self.engine.terms(lagrangian, None, **values)
         packed.slopes, packed.curvatures = slopes, H
-        self.engine.run("tgco_expand", B, packed)
+        run(self.engine.library.tgco_expand, B, self.engine.lanes, packed)
         return slopes, H
 
     def violation(self, problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
         if not self.engine.measures:
             return super().violation(problem, X, U, obstacles)
-        worst, name = X.new_empty(problem.B), "tgco_penetration" if obstacles else "tgco_violation"
-        self.engine.run(name, problem.B, self.engine.placed(problem, X=X.contiguous(), U=U.contiguous(), merit=worst))
+        worst, library = X.new_empty(problem.B), self.engine.library
+        packed = self.engine.packed(problem, OF_ROWS, X=X.contiguous(), U=U.contiguous(), merit=worst)
+        run(library.tgco_penetration if obstacles else library.tgco_violation, problem.B, self.engine.lanes, packed)
         return worst
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
-        parts = [c.bare for c in problem.constraints]
-        others = [row for row in parts if type(row) is not BoundSpheres]
-        if len(others) == len(parts):
+        others = [row for row in problem.distances if type(row) is not BoundSpheres]
+        if len(others) == len(problem.distances):
             return clearance_of(others, X, share)
         U, least = X.new_zeros(problem.B, problem.N, problem.m), X.new_empty(problem.B)
         contact = 1.0 - (TOUCH if share is None else share)
-        packed = self.engine.placed(problem, X=X.contiguous(), U=U, merit=least, gain=contact)
-        self.engine.run("tgco_chords", problem.B, packed)
-        return clearance_of(others, X, share, least)
+        packed = self.engine.packed(problem, OF_ROWS, X=X.contiguous(), U=U, merit=least, gain=contact)
+        run(self.engine.library.tgco_chords, problem.B, self.engine.lanes, packed)
+        return clearance_of(others, X, share, least) if others else least
 
     def rolled_out(self, problem: Problem, X: Tensor, U: Tensor, gains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         B, worst = problem.B, X.new_empty(problem.B)
         X, U = X.clone(memory_format=torch.contiguous_format), U.clone(memory_format=torch.contiguous_format)
-        packed = self.engine.placed(problem, X=X, U=U, gains=gains.contiguous(), merit=worst)
-        self.engine.run("tgco_follow", B, packed)
+        packed = self.engine.packed(problem, OF_ROWS, X=X, U=U, gains=gains.contiguous(), merit=worst)
+        run(self.engine.library.tgco_follow, B, self.engine.lanes, packed)
         return X, U, worst if self.engine.measures else super().violation(problem, X, U)
 
     def judged(self, lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Judged:
@@ -139,7 +143,7 @@ class NativeKernels(Kernels):
             lagrangian, X=X, U=U, regularisation=mu.contiguous(), cost=linear, merit=quadratic, gains=G, status=status,
             optimality=True, **more,
         )  # fmt: skip
-        self.engine.run("tgco_gains", B, packed)
+        run(self.engine.library.tgco_gains, B, self.engine.lanes, packed)
         return BackwardPass(G.transpose(0, 1), linear, quadratic, status != Status.RUNNING)
 
     def costates(self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> Tensor:
@@ -149,20 +153,21 @@ class NativeKernels(Kernels):
         packed = self.engine.terms(
             lagrangian, X=X.contiguous(), U=U.contiguous(), cost=none, merit=none, slopes=found, optimality=True
         )
-        self.engine.run("tgco_costates", problem.B, packed)
+        run(self.engine.library.tgco_costates, problem.B, self.engine.lanes, packed)
         return found
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
         B = lagrangian.problem.B
         for name in ITERATED:
             setattr(s, name, getattr(s, name).contiguous())
-        out = {name: _flags(B) for name in END_FLAGS} | {name: s.merit.new_zeros(B) for name in END_NUMBERS}
+        out = blank_end(B)
         state = {name: getattr(s, name) for name in ITERATED}
         packed = self.engine.terms(
             lagrangian, None, **state, **out, options=native_options(how), limit=limit,
             replicas=self.engine.replicas_of(B),
         )  # fmt: skip
-        self.engine.run("tgco_descend" if begins else "tgco_ilqr", B, packed)
+        library = self.engine.library
+        run(library.tgco_descend if begins else library.tgco_ilqr, B, self.engine.lanes, packed)
         end = pass_end(out)
         if out["lost"].any():
             rows = out["lost"].nonzero().flatten()
@@ -180,7 +185,7 @@ class NativeKernels(Kernels):
             lagrangian, None, **state, converged=accepted, regularisation=mu_r, limit=iteration.LIFTED_STEPS,
             gain=iteration.GAIN,
         )  # fmt: skip
-        self.engine.run("tgco_lift", lagrangian.problem.B, packed)
+        run(self.engine.library.tgco_lift, lagrangian.problem.B, self.engine.lanes, packed)
         return Rollouts(**state, alpha=torch.ones_like(merit), accepted=accepted != 0)
 
     def kept_descent(self, problem: Problem, how: Descent, phr: bool) -> KeptDescent | None:
@@ -190,11 +195,14 @@ class NativeKernels(Kernels):
         return NativeOuter(self.engine, native_options(how), problem, s, **limits) if self.engine.measures else None
 
     def interior(self, problem: Problem) -> InteriorKernels:
-        try:
-            return InteriorEngine(self.engine)
-        except InputError as error:  # second derivatives whose code would be too long
-            self._warn(error)
-            return super().interior(problem)
+        served = current_device(), self.engine.B
+        if served not in self._interiors:
+            try:
+                self._interiors[served] = InteriorEngine(self.engine)
+            except InputError as error:  # second derivatives whose code would be too long
+                self._warn(error)
+                return super().interior(problem)
+        return self._interiors[served]
 
     def sample(self, problem: Problem, U: Tensor, how: Sampling) -> Tensor:
         if how.dtype not in self._samplers:  # compiled at the first call: most solves never sample

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Distance
 from torchgco.dynamics import rollout
 from torchgco.eager import sampling
 from torchgco.ilqr.riccati import BackwardPass, backward
@@ -78,7 +77,7 @@ class Kernels:
 
     def chord_clearance(self, problem: Problem, X: Tensor, share: float | None) -> Tensor:
         """See `kernels.chord_clearance`."""
-        return clearance_of([c.bare for c in problem.constraints], X, share)
+        return clearance_of(problem.distances, X, share)
 
     def rolled_out(self, problem: Problem, X: Tensor, U: Tensor, gains: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `kernels.rolled_out`."""
@@ -138,11 +137,10 @@ def _is_rounding(old: Tensor, new: Tensor) -> Tensor:
     return ((new - old).abs() <= most).flatten(1).all(-1)
 
 
-def clearance_of(parts: list[Any], X: Tensor, share: float | None, least: Tensor | None = None) -> Tensor:
-    """Smallest distance (B,) from the lines between knots to those of the parts that keep a distance; or `least`."""
+def clearance_of(parts: Sequence[Any], X: Tensor, share: float | None, least: Tensor | None = None) -> Tensor:
+    """Smallest distance (B,) from the lines between knots to parts that keep a distance, or `least`."""
     least = X.new_full(X.shape[:1], torch.inf) if least is None else least
     for row in parts:
-        if isinstance(row, Distance):
-            away = row.chord_clearance(X) if share is None else row.chord_clearance(X, share)
-            least = torch.minimum(least, away)
+        away = row.chord_clearance(X) if share is None else row.chord_clearance(X, share)
+        least = torch.minimum(least, away)
     return least

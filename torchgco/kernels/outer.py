@@ -46,8 +46,7 @@ class NativeOuter:
         self.engine, self.state, self.b = engine, s, problem.B
         _make_contiguous(s)
         b = problem.B
-        self.out = {name: torch.zeros(b, dtype=torch.int32) for name in END_FLAGS}
-        self.out |= {name: torch.zeros(b, dtype=torch.float64) for name in END_NUMBERS}
+        self.out = blank_end(b)
         self.outcome = torch.zeros(b, dtype=torch.int64)
         m, best = s.multipliers, s.best
         packed = engine.terms(
@@ -99,9 +98,14 @@ class NativeOuter:
         return self.out["status"] == End.ENDED
 
     def _run(self, **fields: int) -> None:
-        for name, value in fields.items():
-            setattr(self.outer, name, value)
+        self.outer.fill(fields)
         run(self.engine.library.tgco_outer, self.b, self.engine.lanes, self.outer)
+
+
+def blank_end(b: int) -> dict[str, Tensor]:
+    """What a pass over b problems writes END_FLAGS and END_NUMBERS to."""
+    flags = zip(END_FLAGS, torch.zeros(len(END_FLAGS), b, dtype=torch.int32), strict=True)
+    return dict(flags) | dict(zip(END_NUMBERS, torch.zeros(len(END_NUMBERS), b, dtype=torch.float64), strict=True))
 
 
 def pass_end(out: Mapping[str, Tensor]) -> PassEnd:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchgco.constraints.base import Distance
 from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.dynamics import rollout
@@ -17,7 +16,7 @@ from torchgco.lagrangian.lagrangian import Lagrangian
 from torchgco.native.interior import InteriorKernels
 from torchgco.problem.problem import Problem
 from torchgco.problem.scale import CostScale
-from torchgco.problem.times import bends, bulge, paths
+from torchgco.problem.times import bulge, paths
 
 
 def open_loop(problem: Problem, U: Tensor) -> Tensor:
@@ -86,15 +85,12 @@ def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) ->
     return kernels_of(problem).violation(problem, X, U, obstacles)
 
 
-def cost_unit(problem: Problem) -> Tensor:
-    """`problem.cost_unit` (B,), computed as `cost_scale`."""
-    return cost_scale(problem).unit
-
-
 def cost_scale(problem: Problem) -> CostScale:
     """`problem.cost_scale`, computed without autodiff where compiled code can; the problem keeps it."""
+    if (known := problem.derived.get("cost_scale")) is not None:
+        return known
     whole = problem if problem.part_of is None else problem.part_of[0]
-    if "cost_scale" not in problem.derived and "cost_scale" not in whole.derived:
+    if "cost_scale" not in whole.derived:
         first = whole if whole.B <= problem.B else problem
         kernels_of(first).scale(first)
     return problem.cost_scale
@@ -121,10 +117,10 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     Exact where a path may touch; elsewhere that of its chords, which are then farther away than it leaves them.
     """
-    if not any(isinstance(row.bare, Distance) for row in problem.constraints):
+    if not problem.distances:
         return X.new_full(X.shape[:1], torch.inf)
-    clearance = chord_clearance(problem, X)
-    if not bends(problem):
+    clearance = kernels_of(problem).chord_clearance(problem, X, None)
+    if not problem.bends:
         return clearance
     off = bulge(problem, X, U)
     near = (clearance < off).nonzero().flatten()
@@ -133,8 +129,7 @@ def path_clearance(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     for path in paths(problem.take(near), X[near], U[near], off[near]):
         if path.pieces > 1:
             rows = near[path.rows]
-            parts = (constraint.bare for constraint in problem.take(rows).constraints)
-            fine = [row.in_pieces(path.pieces) for row in parts if isinstance(row, Distance)]
+            fine = [row.in_pieces(path.pieces) for row in problem.take(rows).distances]
             clearance[rows] = clearance_of(fine, path.X, None)
     return clearance
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from torchgco.base.errors import InputError
 from torchgco.base.options import Above, Seconds, check_options
 from torchgco.base.shapes import Dimensions, check_shape, check_tensor, tensor
-from torchgco.base.tree import is_users
 from torchgco.constraints.base import Constraint, Sense
 from torchgco.constraints.bounds import bounds_of
 from torchgco.dynamics.base import Dynamics
@@ -206,8 +205,7 @@ def settled(problem: Problem) -> Problem:
 
     Where a user's code is part of it, which may read what changes meanwhile, every plan looks again.
     """
-    parts = problem.dynamics, problem.cost, *problem.constraints
-    return problem if any(map(is_users, parts)) else current(problem.renewed())
+    return problem if problem.users else current(problem.renewed())
 
 
 def continued(

@@ -150,7 +150,7 @@ class _Loop:
         self.request, self.over, self.done = Request(), False, False
         self.before: Numbers | None = None
         self._heard, self._answered, self._stopped = heard, SimpleQueue[None](), False
-        self._ask, self._how = _ASK(self._asked), how.copy()
+        self._ask, self._how = _ASK(self._asked), how.fill({}, copied=True)
         self._how.ask = ctypes.cast(self._ask, ctypes.c_void_p).value
         self._call = lambda: function(ctypes.byref(self._how), ctypes.c_int64(first), ctypes.c_int64(last))
         self.thread = Thread(target=self._run, daemon=True)

@@ -52,18 +52,23 @@ class Structure(ctypes.Structure):
         if values:
             self.fill(values)
 
-    def fill(self, values: Mapping[str, Any]) -> None:
-        """Set fields by name."""
-        declared, tensors, kept = self.declared, self.tensors, self.kept
+    def fill(self, values: Mapping[str, Any], copied: bool = False) -> Self:
+        """This structure, or a copy where it is `copied`, with other values of fields by name."""
+        filled = self
+        if copied:
+            filled = type(self).from_buffer_copy(self)
+            _set(filled, "kept", [self])
+        declared, tensors, kept = self.declared, self.tensors, filled.kept
         for name, value in values.items():
             # Most fields of a call are tensors or numbers, and each solve makes thousands of calls.
             if type(value) is Tensor and value.dtype is tensors.get(name) and value.is_contiguous():
                 kept.append(value)
-                _set(self, name, value.data_ptr())
+                _set(filled, name, value.data_ptr())
             elif isinstance(value, PLAIN) and name in declared:
-                _set(self, name, value)
+                _set(filled, name, value)
             else:
-                self.__setattr__(name, value)
+                filled.__setattr__(name, value)
+        return filled
 
     @classmethod
     def complete(cls, **values: Any) -> Self:
@@ -72,14 +77,6 @@ class Structure(ctypes.Structure):
             raise TypeError(f"{cls.__name__} lacks {', '.join(sorted(missing))}")
         return cls(**values)
 
-    def copy(self, values: Mapping[str, Any] | None = None) -> Self:
-        """The same, with other values of fields by name."""
-        other = type(self).from_buffer_copy(self)
-        _set(other, "kept", [self])
-        if values:
-            other.fill(values)
-        return other
-
     def __setattr__(self, name: str, value: Any) -> None:
         if name not in self.declared:
             raise AttributeError(f"{type(self).__name__} has no field {name}")
@@ -87,19 +84,16 @@ class Structure(ctypes.Structure):
             self.kept.append(value)
             of: Any = type(value[0]) if value else None
             value = (of * len(value))(*value) if value else None
-        if isinstance(value, (Tensor, ctypes.Structure, ctypes.Array)):
+        if isinstance(value, Tensor):
+            expected, dtype = self.tensors.get(name), value.dtype
+            if dtype != expected or not value.is_contiguous():
+                raise TypeError(f"{name}: expected a contiguous tensor of {expected}, got {dtype}, {value.stride()}")
             self.kept.append(value)
-            value = self._address(name, value) if self.declared[name].pointer else value
+            value = value.data_ptr()
+        elif isinstance(value, (ctypes.Structure, ctypes.Array)):
+            self.kept.append(value)
+            value = ctypes.addressof(value) if self.declared[name].pointer else value
         return _set(self, name, value)
-
-    def _address(self, name: str, value: Any) -> int:
-        """Where a value begins that a field points to."""
-        if not isinstance(value, Tensor):
-            return ctypes.addressof(value)
-        expected = self.tensors.get(name)
-        if value.dtype != expected or not value.is_contiguous():
-            raise TypeError(f"{name}: expected a contiguous tensor of {expected}, got {value.dtype}, {value.stride()}")
-        return value.data_ptr()
 
 
 def kept_by(structure: Structure) -> dict[int, Any]:

@@ -49,6 +49,8 @@ from torchgco.problem.problem import Problem
 
 NO_MEMORY = "native kernels: no memory"
 LANES_OF_ONE = 4  # that a problem alone makes use of: for steps of a line search, and candidates along several paths
+# What of a problem is packed, and kept with it: all but multipliers and guide, the same without the cost, the model.
+WHOLE, OF_ROWS, OF_MODEL, ROWS = "packed", "packed without cost", "packed model", "packed rows"
 MAX_VARIABLES = 128  # states and controls together: the matrices of a stage lie on the stack
 
 
@@ -142,87 +144,66 @@ class Engine:
         """How many lanes share the line search of each of B problems."""
         return self.lanes // 2 ** (B - 1).bit_length() if self.lanes >= B else 1
 
-    def run(self, name: str, B: int, packed: c.Problem) -> None:
-        """Call a function of the library on B problems."""
-        run(getattr(self.library, name), B, self.lanes, packed)
+    def packed(self, problem: Problem, what: str = WHOLE, **values: Any) -> c.Problem:
+        """A problem without multipliers or a guide, and further fields, in the form that the library reads.
 
-    def packed(self, problem: Problem, **values: Any) -> c.Problem:
-        """A problem without multipliers or a guide, and further fields, in the form that the library reads."""
+        Args:
+            what: measures read the constraints without the cost, and rollouts the model alone: many problems are
+                rolled out and not solved.
+        """
         if problem.part_of is not None:
             problem, values["numbers"] = problem.part_of
-        return self._fixed(problem).copy(values)
-
-    def placed(self, problem: Problem, **values: Any) -> c.Problem:
-        """The same without the cost: what measures read."""
-        if problem.part_of is not None:
-            problem, values["numbers"] = problem.part_of
-        return self._rows(problem)[0].copy(values)
-
-    def rolled(self, problem: Problem, **values: Any) -> c.Problem:
-        """The model alone, and further fields: what rollouts read. Many problems are rolled out and not solved."""
-        if problem.part_of is not None:
-            problem, values["numbers"] = problem.part_of
-        return self._model(problem).copy(values)
+        return (problem.derived.get(what) or self._kept(problem, what)).fill(values, copied=True)
 
     def terms(self, lagrangian: Lagrangian, best: Multipliers | None = None, **values: Any) -> c.Problem:
         """The same with the terms that the Lagrangian adds to the cost; `best` are those of an outer loop's best."""
         if best is not None:
-            packed = self._summed(lagrangian, best)
-            packed.fill(values)
-            return packed
+            return self._summed(lagrangian, best).fill(values)
         if "packed" not in lagrangian.derived:  # several calls of an inner solve read the same terms
             lagrangian.derived["packed"] = self._summed(lagrangian)
-        return lagrangian.derived["packed"].copy(values)
+        return lagrangian.derived["packed"].fill(values, copied=True)
 
     def _summed(self, lagrangian: Lagrangian, best: Multipliers | None = None) -> c.Problem:
         """The problem with multipliers, penalties and guide."""
-        multipliers = lagrangian.multipliers
+        multipliers, penalty = lagrangian.multipliers, lagrangian.penalty
         fields: dict[str, Any] = {"mu": multipliers.mu.contiguous(), "phr": lagrangian.phr}
         if best is not None or not multipliers.blank:
             none = [None] * len(multipliers.lam)
             own = none if multipliers.blank else [lam.contiguous() for lam in multipliers.lam]
             pairs = zip(self.rows(lagrangian.problem), own, none if best is None else best.lam, strict=True)
-            fields["constraint"] = [row.copy({"lam": lam, "best": kept}) for row, lam, kept in pairs]
-        return self.packed(lagrangian.problem, **fields, **guide_of(lagrangian.penalty))
+            fields["constraint"] = [row.fill({"lam": lam, "best": kept}, copied=True) for row, lam, kept in pairs]
+        return self.packed(lagrangian.problem, **fields, **({} if penalty is None else guide_of(penalty)))
 
     def rows(self, problem: Problem) -> list[c.Constraint]:
         """Constraints without multipliers."""
-        return self._rows(problem if problem.part_of is None else problem.part_of[0])[1]
+        if problem.part_of is not None:
+            problem, _ = problem.part_of
+        if ROWS not in problem.derived:
+            places = range(len(problem.constraints))
+            problem.derived[ROWS] = [self._row(problem, i) if problem.B > 0 else c.Constraint() for i in places]
+        return problem.derived[ROWS]
 
-    def _fixed(self, problem: Problem) -> c.Problem:
-        """The parts that don't change from call to call: model, cost and constraints; kept with the problem."""
-        return problem.derived.get("packed") or problem.derive("packed", lambda: self._fixed_made(problem))
-
-    def _fixed_made(self, problem: Problem) -> c.Problem:
-        packed = self._rows(problem)[0].copy()
-        make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
-        if problem.B > 0:
-            of_each = self.cost is not None
-            packed.cost_data, packed.bounded = _of_last(problem, "cost", problem.cost, of_each, make)
-        return packed
-
-    def _rows(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
-        """Model and constraints, and the latter alone."""
-        return problem.derived.get("rows packed") or problem.derive("rows packed", lambda: self._made(problem))
-
-    def _model(self, problem: Problem) -> c.Problem:
-        """The model's part of it."""
-        pack = lambda: c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
-        return problem.derive("model packed", lambda: _of_last(problem, "dynamics", problem.dynamics, True, pack))
+    def _kept(self, problem: Problem, what: str) -> c.Problem:
+        """The parts that don't change from call to call; kept with the problem."""
+        if what == OF_MODEL:
+            pack = lambda: c.Problem(N=problem.N, parameters=self.model_numbers(problem), **shared_fields(self.shared))
+            made = _of_last(problem, "dynamics", problem.dynamics, True, pack)
+        elif what == OF_ROWS:
+            rows = self.rows(problem)
+            made = self.packed(problem, OF_MODEL, constraints=len(rows), constraint=rows)
+        else:
+            made, of_each = self.packed(problem, OF_ROWS), self.cost is not None
+            make = lambda: (self.cost_numbers(problem), int(self.cost is None and is_bounded(problem.cost)))
+            if problem.B > 0:
+                made.cost_data, made.bounded = _of_last(problem, "cost", problem.cost, of_each, make)
+        problem.derived[what] = made
+        return made
 
     def model_numbers(self, problem: Problem) -> c.Array:
         """The model's numbers of each problem."""
         if self.model.count == 0 or problem.B == 0:
             return c.Array()
         return array(self.model.numbers(problem.B, problem.dynamics, self.shared.model), knots=True)
-
-    def _made(self, problem: Problem) -> tuple[c.Problem, list[c.Constraint]]:
-        if problem.B == 0:
-            return c.Problem(), [c.Constraint() for _ in problem.constraints]
-        rows = [self._row(problem, i) for i in range(len(problem.constraints))]
-        packed = self._model(problem).copy()
-        packed.constraints, packed.constraint = len(rows), rows
-        return packed, rows
 
     def cost_numbers(self, problem: Problem) -> list[c.Array]:
         """The cost's arrays."""

@@ -121,7 +121,7 @@ class InteriorKernels:
         out = {"status": torch.zeros(problem.B, dtype=torch.int32)}
         out["iterations"] = torch.zeros(problem.B, dtype=torch.int64)
         out["gains"] = X.new_zeros(problem.B, problem.N, problem.m, problem.n + 1)
-        rows = [row.copy({"lam": lam}) for row, lam in zip(self._rows(problem), multipliers, strict=True)]
+        rows = [row.fill({"lam": lam}, copied=True) for row, lam in zip(self._rows(problem), multipliers, strict=True)]
         return self._with(problem, X=X, U=U, constraint=rows, **out), out
 
     def _rows(self, problem: Problem) -> list[structures.Constraint]:
@@ -167,7 +167,7 @@ def interior(
     ends = {name: barrier.new_zeros(problem.B) for name in ("error", "theta", "falls")}
     own = {"of": packed, "barrier": barrier, "free_start": free_components(problem)}
     scales = {"constant": scale.constant, "least_cost": scale.size}
-    return _of_options(options).copy(own | scales | ends), ends
+    return _of_options(options).fill(own | scales | ends, copied=True), ends
 
 
 @lru_cache(maxsize=64)
@@ -221,8 +221,8 @@ class Kept(KeptProblem):
         self._feedback = self._gains[..., :-1]
         self.statuses, self.violations = self.status.numpy(), self.worst.numpy()
         self._barrier, self._iterations = self.barrier.numpy(), self.iterations.numpy()
-        self._follow = self.packed.copy()
-        self._follow.fill({"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst})
+        rolled = {"X": self.rolled[0], "U": self.rolled[1], "merit": self.worst}
+        self._follow = self.packed.fill(rolled, copied=True)
         self.how, _ = interior(problem, self.packed, self.barrier, scale, options)
 
     def solve(self, rows: np.ndarray, mu: float, seconds: float) -> None:

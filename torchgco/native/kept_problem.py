@@ -134,8 +134,7 @@ class KeptDescent(KeptProblem):
         self.packed.fill({"mu": self.mu, "phr": phr, "bounded": bounded, "options": options, **state})
         self.packed.fill({"limit": options.max_iterations, "replicas": engine.replicas_of(B)})
         self.worst = like.new_zeros(B)
-        self._measured = self.packed.copy()
-        self._measured.fill({"merit": self.worst})
+        self._measured = self.packed.fill({"merit": self.worst}, copied=True)
         # The same memory by NumPy, which takes a small share of PyTorch's time for a few numbers.
         self._x0, self._X, self._U = (tensor.numpy() for tensor in (problem.x0, self.X, self.U))
         self._lam, self._mu = [tensor.numpy() for tensor in self.lam], self.mu.numpy()

@@ -127,7 +127,8 @@ def signed_distance(p: Coordinates, half: Coordinates) -> Tensor:
     deepest = reduce(torch.maximum, (x.abs() - h for x, h in zip(p, half, strict=True)))
     outside = deepest > 0
     # The root of 0 has no slope: inside, where the root isn't used, it is taken of 1.
-    return torch.where(outside, torch.where(outside, _square(excess(p, half)), 1.0).sqrt(), deepest)
+    square = reduce(torch.add, (x * x for x in excess(p, half)))
+    return torch.where(outside, torch.where(outside, square, 1.0).sqrt(), deepest)
 
 
 def nearest(begin: Coordinates, along: Coordinates, half: Coordinates) -> Tensor:
@@ -185,7 +186,3 @@ def at_share(begin: Coordinates, along: Coordinates, share: Tensor) -> list[Tens
 def _along(axes: Tensor, v: Coordinates) -> list[Tensor]:
     """Coordinates of vectors along the rows of axes (..., d, d)."""
     return [reduce(torch.add, (axes[..., i, j] * v[j] for j in range(len(v)))) for i in range(len(v))]
-
-
-def _square(v: Coordinates) -> Tensor:
-    return reduce(torch.add, (x * x for x in v))

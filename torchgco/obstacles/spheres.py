@@ -61,8 +61,9 @@ class Spheres(Constraint):
         centers = torch.where(absent.unsqueeze(-1), 0.0, centers)
         inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
         knots = resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from)
+        made = _matrices(centers, inflated, velocities, absent)
         at, dt = dims.position, dims.dt or 0.0
-        return BoundSpheres.prepare(centers, inflated, velocities, absent, vehicle, knots, at, dt)
+        return BoundSpheres(centers, inflated, velocities, absent, vehicle, knots, at, dt, **made)
 
 
 @dataclass(frozen=True)
@@ -87,36 +88,6 @@ class BoundSpheres(OwnKind):
     )  # fmt: skip
 
     c_kernel: ClassVar[str] = "spheres"
-
-    @classmethod
-    def prepare(
-        cls,
-        centers: Tensor,
-        inflated_radii: Tensor,
-        velocities: Tensor | None,
-        absent: Tensor,
-        vehicle_radius: Tensor,
-        knots: Any,
-        position: slice,
-        dt: float,
-    ) -> BoundSpheres:
-        o, present = centers, (~absent).to(centers.dtype).unsqueeze(-1)  # absent: left out of sums
-        rows = [2 * o, -present, (inflated_radii.square() - o.square().sum(-1)).unsqueeze(-1)]
-        first, second = [present, o], [_outer(o, o)]
-        if velocities is not None:
-            v = velocities
-            rows += [2 * v, -2 * (o * v).sum(-1, keepdim=True), -v.square().sum(-1, keepdim=True)]
-            first += [v]
-            second += [_outer(o, v) + _outer(v, o), _outer(v, v)]
-        weights = torch.cat(rows, dim=-1)
-        # An absent sphere is c = -1 everywhere: satisfied, with a multiplier that stays zero.
-        constant = torch.zeros_like(weights)
-        constant[..., o.shape[-1] + 1] = -1.0
-        weights = torch.where(absent.unsqueeze(-1), constant, weights).mT.contiguous()
-        return cls(
-            centers, inflated_radii, velocities, absent, vehicle_radius, knots, position, dt,
-            weights, torch.cat(first, dim=-1), torch.cat(second, dim=-1),
-        )  # fmt: skip
 
     def rows(self, p: Tensor, t: Tensor) -> Tensor:
         return torch.bmm(self._features(p, t.unsqueeze(-1)), self.weights)
@@ -193,9 +164,8 @@ class BoundSpheres(OwnKind):
 
     def remade(self, **changes: Tensor | None) -> BoundSpheres:
         """The same with other numbers, and matrices of the numbers as they are."""
-        names = "centers", "inflated_radii", "velocities", "absent", "vehicle_radius", "knots", "position", "dt"
-        numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | changes
-        return replace(self.prepare(**numbers), stops=self.stops)
+        made = replace(self, **changes)  # type: ignore[arg-type]
+        return replace(made, **_matrices(made.centers, made.inflated_radii, made.velocities, made.absent))
 
     def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         if bool(self.absent.any()):
@@ -388,6 +358,23 @@ def from_origin(a: Tensor, along: Tensor) -> Tensor:
     length = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
     nearest = a - ((a * along).sum(-1, keepdim=True) / length).clamp(-1.0, 0.0) * along
     return nearest.square().sum(-1).sqrt()
+
+
+def _matrices(o: Tensor, radii: Tensor, v: Tensor | None, absent: Tensor) -> dict[str, Tensor]:
+    """The matrices of a BoundSpheres, from its centres, inflated radii, velocities, and which are absent."""
+    present = (~absent).to(o.dtype).unsqueeze(-1)  # absent: left out of sums
+    rows = [2 * o, -present, (radii.square() - o.square().sum(-1)).unsqueeze(-1)]
+    first, second = [present, o], [_outer(o, o)]
+    if v is not None:
+        rows += [2 * v, -2 * (o * v).sum(-1, keepdim=True), -v.square().sum(-1, keepdim=True)]
+        first += [v]
+        second += [_outer(o, v) + _outer(v, o), _outer(v, v)]
+    weights = torch.cat(rows, dim=-1)
+    # An absent sphere is c = -1 everywhere: satisfied, with a multiplier that stays zero.
+    constant = torch.zeros_like(weights)
+    constant[..., o.shape[-1] + 1] = -1.0
+    weights = torch.where(absent.unsqueeze(-1), constant, weights).mT.contiguous()
+    return {"weights": weights, "first": torch.cat(first, dim=-1), "second": torch.cat(second, dim=-1)}
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

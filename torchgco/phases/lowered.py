@@ -128,14 +128,9 @@ class Whole:
             for row in jump.constraints:
                 yield _shifted(row, replace(span, n=landing.jump.n, m=jump.controls), stretch)
         if self.phases.closing is not None:
-            x0 = self.members[0].x0
-            dims = Dimensions(len(x0), stretch.N, self._common, stretch.m, None, None, x0)
+            x0, common = self.members[0].x0, min(self.members[0].n, self.members[-1].n)
+            dims = Dimensions(len(x0), stretch.N, common, stretch.m, None, None, x0)
             yield self.phases.closing.bind(dims)
-
-    @property
-    def _common(self) -> int:
-        """How many states the first phase and the last one have in common."""
-        return min(self.members[0].n, self.members[-1].n)
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
         for ax, name in zip(row, shown, strict=False):
             _as_rate(ax, name)
         for ax in row:
-            ax.set_xlabel(_words(variable))
+            ax.set_xlabel(WORDS.get(variable, variable.split(".")[-1].replace("_", " ")))
             tidy(ax, title if ax is row[0] else "")
     lines = [Line2D([], [], color=colour, marker="o", label=solver) for solver, colour in colours.items()]
     patches = [Patch(color=colour, label=solver) for solver, colour in colours.items()]
@@ -121,11 +121,6 @@ def _shown(rows: pd.DataFrame) -> list[str]:
     if f"{FAILED_OUTCOMES[0]}_n" not in rows.columns:
         return [name for name in OUTCOMES if rows[f"{name}_n"].sum() > 0]
     return ["reached", *(name for name in FAILED_OUTCOMES if rows[f"{name}_count"].sum() > 0)]
-
-
-def _words(variable: str) -> str:
-    """A swept variable for a reader: no key of the command line, with its unit where it has one."""
-    return WORDS.get(variable, variable.split(".")[-1].replace("_", " "))
 
 
 def _interval(values: Mapping[str, Any] | pd.DataFrame, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

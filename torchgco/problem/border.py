@@ -18,7 +18,7 @@ from torchgco.base.errors import InputError, theirs
 from torchgco.base.mixing import why
 from torchgco.base.shapes import MISTAKES, describe
 from torchgco.base.tree import is_users
-from torchgco.base.values import asks_for_knot, whole_numbers_become
+from torchgco.base.values import taken_by, whole_numbers_become
 from torchgco.constraints.base import Constraint, FunctionConstraint
 from torchgco.constraints.bounds import RateBounds
 from torchgco.costs.base import Cost, FunctionCost
@@ -112,7 +112,7 @@ def check_cost(cost: Cost, x0: Tensor, N: int, m: int) -> None:
 
     _check_among_all("cost.stage", lambda i, x, u: stage(i, x, u, 0), rows, len(x0), (X[:, 0], U[:, 0]))
     _check_among_all("cost.terminal", lambda i, x: cost.take(i).terminal(x), rows, len(x0), (X[:, -1],))
-    row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or asks_for_knot(cost.stage_function)
+    row_cost, takes_k = cost.take(rows), not isinstance(cost, FunctionCost) or taken_by(cost.stage_function).knot
     _check_axes("cost.stage", lambda k, x, u: row_cost.stage(x, u, k), takes_k, k, X[:, :-1], U)
     _check_cost_of_stages(cost, takes_k, rows, k, X[:, :-1], U)
     _check_axes("cost.terminal", lambda _, x: row_cost.terminal(x), False, k[:1], X[:, -1:])
@@ -225,7 +225,7 @@ def _check_rows(constraint: FunctionConstraint, field: str, rows: Tensor, B: int
     if differing is not None:
         got = f"rows of knot {int(knots[differing])} that depend on other knots or problems, or on how many there are"
         raise InputError(field, ONE_KNOT, got)
-    _check_axes(field, constraint.take(rows).rows_at, asks_for_knot(constraint.function), knots, *arguments)
+    _check_axes(field, constraint.take(rows).rows_at, taken_by(constraint.function).knot, knots, *arguments)
 
 
 def _check_rows_of_class(constraint: Constraint, field: str, rows: Tensor, X: Tensor, U: Tensor) -> None:

@@ -151,20 +151,22 @@ def _facts(fields: Mapping[str, Any]) -> tuple[Hashable, ...]:
     return *facts, *(_Itself(fields[name]) for name in ("dynamics", "cost")), *facts_of(fields)
 
 
-def facts_of(tree: Any) -> Iterator[Hashable]:
+def facts_of(tree: Any) -> list[Hashable]:
     """What tells whether functions and numbers in nested parts have changed."""
+    facts = list[Hashable]()
     for leaf in leaves(tree):
         if isinstance(leaf, Tensor):
-            yield 0 if leaf.is_inference() else leaf._version
+            facts.append(0 if leaf.is_inference() else leaf._version)
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
-                yield _sum(leaf.detach())
+                facts.append(_sum(leaf.detach()))
         elif isinstance(leaf, (int, float, str, bytes, Number)) or leaf is None or type(leaf) in ALONE:
-            yield leaf
+            facts.append(leaf)
         elif callable(leaf):
-            yield _Itself(leaf)
+            facts.append(_Itself(leaf))
         elif isinstance(leaf, np.ndarray) or hasattr(leaf, "__array__") or isinstance(leaf, (Collection, memoryview)):
-            yield _sum(leaf)
+            facts.append(_sum(leaf))
+    return facts
 
 
 def _sum(numbers: Any) -> int | None:
@@ -203,12 +205,20 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
             class has one method of its own and inherits another that doesn't know it, such as `stage` and `expand`. Or
             it has something else by a name that torchgco's class has, such as a number by that of a method.
     """
-    for name, heir, meant in _shadowed(part):
+    by_user = not _is_ours(type(part))
+    for name, heir, meant in _shadowed(part) if by_user else ():
         expected = f"another name: by this one {heir} means {meant}"
         raise InputError(f"{field}.{name}", expected, f"one of {type(part).__name__}")
     result = part.bind(dims)
     if not isinstance(result, kind):
         raise InputError(f"{field}.bind", f"a method that returns a {kind.__name__}", describe(result))
+    if by_user or is_users(result):
+        _check_bound(part, result, field)
+    return result
+
+
+def _check_bound(part: Any, result: Any, field: str) -> None:
+    """Raise InputError for what a user's class has bound a part to, as `bound` says."""
     if isinstance(result, Constraint) and is_users(result):
         knots = getattr(result, "knots", None)
         if not isinstance(knots, slice) and not (isinstance(knots, Tensor) and knots.dtype == torch.int64):
@@ -220,7 +230,6 @@ def bound(part: Any, dims: Dimensions, field: str, kind: type[Part]) -> Part:
     for users, name, heir in _torn(result):
         expected = f"a method of {type(result).__name__}, which has a `{users}` of its own, or a class without {heir}'s"
         raise InputError(f"{field}.{name}", expected, f"the one of {heir}, which doesn't call this `{users}`")
-    return result
 
 
 def remember(pairs: Iterable[tuple[Any, Any]]) -> None:
@@ -267,8 +276,6 @@ def _lost(part: Any, result: Any) -> Iterator[str]:
 
 def _shadowed(part: Any) -> Iterator[tuple[str, str, str]]:
     """Names of a user's class by which one of ours means something else: this class, and what it means."""
-    if _is_ours(type(part)):
-        return
     line = type(part).__mro__
     named = {name: None for cls in line if not _is_ours(cls) for name in (*vars(cls), *inspect.get_annotations(cls))}
     for name in named:

@@ -17,7 +17,7 @@ from torchgco.base.autodiff import gradient_and_hessian
 from torchgco.base.errors import InputError
 from torchgco.base.shapes import lead
 from torchgco.base.tree import passed_on
-from torchgco.base.values import asks_for_knot
+from torchgco.base.values import taken_by
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import bounds_of
 from torchgco.costs.base import Cost, FunctionCost, WrappedCost, add_blocks
@@ -38,8 +38,9 @@ def for_solvers(problem: Problem, joins_knots: bool = False) -> Problem:
     """
     if problem.time is not None:
         return in_time(problem)
-    within = within_horizons(problem)
-    return within if joins_knots else with_carried(within)
+    within = problem if problem.horizon is None else within_horizons(problem)
+    carries = not joins_knots and any(row.joins_knots for row in within.constraints)
+    return with_carried(within) if carries else within
 
 
 def states_for_solvers(problem: Problem, X: Tensor, U: Tensor, factors: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -145,7 +146,7 @@ def _cost(problem: Problem, running: Tensor) -> Cost:
     if isinstance(cost, BoundQuadratic) and cost.kernel == "quadratic":
         return cost.ending(problem.stages, running, resting)
     if isinstance(cost, FunctionCost):
-        if cost.terminal_function is not None and asks_for_knot(cost.terminal_function):
+        if cost.terminal_function is not None and taken_by(cost.terminal_function).knot:
             raise InputError("horizon", "a terminal function without an argument k: `knot_values` serve", "one with it")
         cost = replace(cost, values=cost.values.ending_at(problem.stages))
     X, U = problem.at_rest

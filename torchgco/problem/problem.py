@@ -13,7 +13,7 @@ from torch import Tensor
 from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Count, check_value
 from torchgco.base.shapes import Dimensions, as_states, check_tensor, computing_on, describe
-from torchgco.base.tree import Rows, cast, field_names, is_users, is_whole
+from torchgco.base.tree import Rows, cast, field_names, is_users
 from torchgco.constraints.base import Constraint
 from torchgco.constraints.bounds import Bounds, bounds_of, joined_bounds
 from torchgco.costs.base import Cost, ShiftedCost
@@ -144,7 +144,7 @@ class Problem(Subset):
         """Which stages are a problem's own, (B, N) bool."""
         return torch.arange(self.N, device=self.x0.device) < self.stages.unsqueeze(-1)
 
-    @property
+    @cached_property
     def position(self) -> slice:
         """The position's place in the state.
 
@@ -156,12 +156,12 @@ class Problem(Subset):
             raise InputError("dynamics.position", "a model with a position", type(self.dynamics).__name__)
         return where
 
-    @property
+    @cached_property
     def geometric(self) -> tuple[Constraint, ...]:
         """The constraints on position that sampling and guidance consider."""
         return tuple(c for c in self.constraints if c.geometric)
 
-    @property
+    @cached_property
     def obstacles(self) -> tuple[Obstacles, ...]:
         """The constraints that are obstacles, of whatever kind."""
         return tuple(c for c in self.constraints if isinstance(c, Obstacles))
@@ -171,7 +171,7 @@ class Problem(Subset):
         """The bounds on controls, those of several parts as one; None where there are none."""
         return joined_bounds(bounds_of(self.constraints, "u"), self.N)
 
-    @property
+    @cached_property
     def start_is_clear(self) -> Tensor:
         """Whether each problem starts outside its obstacles, (B,) bool; see `free_start.clear_starts`."""
         find = lambda p: clear_starts(p.constraints, p.x0, p.free_start, p.dynamics.position)
@@ -207,7 +207,7 @@ class Problem(Subset):
         changes = torch.maximum(changes, savings(slopes, curvatures))
         return cost_scale(total, curvatures[:, :-1, self.n :], changes, self.horizon, self.control_bounds)
 
-    @property
+    @cached_property
     def row_shapes(self) -> tuple[tuple[int, int], ...]:
         """Knots and rows of every constraint; the same for all problems of a form."""
         shapes = self.known.row_shapes
@@ -259,7 +259,12 @@ class Problem(Subset):
         """
         if isinstance(index, list):
             index = torch.tensor(index, dtype=torch.int64, device=self.x0.device)
-        if is_whole(index, self.B):
+        B = self.B
+        if isinstance(index, slice):
+            whole = index.indices(B) == (0, B, 1)
+        else:
+            whole = index.numel() == B and (B == 1 or torch.equal(index, torch.arange(B, device=index.device)))
+        if whole:
             return self
         subset = self.subset(index)
         if self.given is not None:

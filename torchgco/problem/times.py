@@ -89,11 +89,6 @@ def between(dynamics: Dynamics, X: Tensor, U: Tensor, k: Tensor, h: Tensor, leng
     return x if model.is_integrated else model.settled(x)  # as its own steps are
 
 
-def bends(problem: Problem) -> bool:
-    """Whether positions may leave the straight lines between their knots: by Euler's steps they don't."""
-    return problem.dynamics.stretches and problem.dynamics.integrator != "euler"
-
-
 def bulge(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
     """How far what is measured leaves the chords of trajectories X (B, N+1, n), U (B, N, m), halfway, (B,), m.
 
@@ -120,7 +115,7 @@ def paths(problem: Problem, X: Tensor, U: Tensor, off: Tensor | None = None) -> 
         off: their bulges (B,), m, where these are known.
     """
     every = torch.arange(len(X), device=X.device)
-    if len(X) == 0 or not bends(problem):
+    if len(X) == 0 or not problem.bends:
         return [Paths(every, 1, X)]
     off = bulge(problem, X, U) if off is None else off
     pieces = (off / ADMITTED).nan_to_num(1.0, 1.0, 1.0).sqrt().ceil().clamp(1, PIECES_AT_MOST)
@@ -146,7 +141,7 @@ def curves(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None = None) 
     """
     whole, X, U = at_times(problem, X, U, times)
     off = None
-    if bends(whole) and whole.dynamics.position is not None and len(X) > 0:
+    if whole.bends and whole.dynamics.position is not None and len(X) > 0:
         apart = states_within(whole, X, U, 2)[:, :, 0] - 0.5 * (X[:, :-1] + X[:, 1:])
         off = apart[..., whole.dynamics.position].norm(dim=-1).amax(-1)
         off = torch.maximum(off, bulge(whole, X, U))

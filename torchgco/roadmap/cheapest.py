@@ -113,7 +113,7 @@ class GraphSearch:
         arrives, ends = torch.zeros(B, dtype=torch.bool), graph.ends.to(torch.int32)
         self._run(
             "tgco_cheapest",
-            {"nodes": graph.points, "ends": ends, "lengths": graph.lengths, "price": self._prices(price, V)},
+            {"nodes": graph.points, "ends": ends, "lengths": graph.lengths, "price": price.to(p).expand(B, V)},
             {"path": path, "string": string, "arrives": arrives}, points=V, edges=K,
         )  # fmt: skip
         return path, string, arrives
@@ -127,24 +127,19 @@ class GraphSearch:
             price: cost per metre at the points of `string`, (B, 2 HOPS + 1).
         """
         tight = path.clone()
-        self._run("tgco_taut", {"string": string, "cost": self._prices(price, string.shape[1])}, {"path": tight})
+        self._run("tgco_taut", {"string": string, "cost": price.to(path).expand(string.shape[:2])}, {"path": tight})
         return tight
 
     def raised(self, price: Tensor, points: Tensor, path: Tensor, factor: float) -> Tensor:
         """Prices (B, V) times a factor at points that are nearer to a path than the largest radius."""
-        V = points.shape[1]
-        price = self._prices(price, V).clone(memory_format=torch.contiguous_format)
-        self._run("tgco_raise", {"nodes": points, "path": path}, {"price": price}, points=V, factor=factor)
+        price = price.to(points).expand(points.shape[:2]).clone(memory_format=torch.contiguous_format)
+        self._run("tgco_raise", {"nodes": points, "path": path}, {"price": price}, points=price.shape[1], factor=factor)
         return price
-
-    def _prices(self, price: Tensor, points: int) -> Tensor:
-        o = self.obstacles.spheres.centers
-        return price.to(o).expand(o.shape[0], points)
 
     def _run(self, name: str, read: dict[str, Tensor], written: dict[str, Tensor], **numbers: float) -> None:
         """Call a function of the library on all problems, by as many threads as PyTorch uses."""
-        arguments = self._shared.copy()
-        arguments.fill({**{field: tensor.contiguous() for field, tensor in read.items()}, **written, **numbers})
+        contiguous = {field: tensor.contiguous() for field, tensor in read.items()}
+        arguments = self._shared.fill({**contiguous, **written, **numbers}, copied=True)
         run(getattr(self.library, name), self.obstacles.spheres.radii.shape[0], GROUP, arguments)
 
     @cached_property

@@ -63,24 +63,19 @@ class Rooms(Quadrotor):
                 raise InputError(f"scenario.{name}", "a point of scenario.region clear of its walls", point)
 
     def _draw_one(self, rng: np.random.Generator) -> Layouts:
+        from scipy.cluster.hierarchy import DisjointSet  # slow to load
+
         walls = [
             (room, axis) for axis in range(3) for room in product(*map(range, self.rooms)) if self._next(room, axis)
         ]
-        joined = {room: room for room in product(*map(range, self.rooms))}
-
-        def root(room: tuple[int, ...]) -> tuple[int, ...]:
-            while joined[room] != room:
-                room = joined[room]
-            return room
-
+        joined = DisjointSet(product(*map(range, self.rooms)))
         order, spare = rng.permutation(len(walls)), rng.uniform(size=len(walls)) < self.loops
         places = rng.uniform(size=(len(walls), 2))
         boxes = self._outer()
         for i in order.tolist():
             room, axis = walls[i]
-            a, b = root(room), root(self._next(room, axis) or room)
-            joined[a] = b
-            boxes += self._wall(room, axis, places[i] if a != b or spare[i] else None)
+            opens = joined.merge(room, self._next(room, axis)) or spare[i]
+            boxes += self._wall(room, axis, places[i] if opens else None)
         centers, halves = (np.array(column)[None] for column in zip(*boxes, strict=True))
         return self._layout(box_centers=centers, box_half_sizes=halves)
 

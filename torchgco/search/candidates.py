@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -144,6 +144,7 @@ class Candidates:
             return iter((rows,) if rows.numel() > 0 else ())
         return iter(rows.split(most))
 
+    @cached_property
     def arrive(self) -> Tensor:
         """Whether each candidate ends near the goal, (B * count,)."""
         return seen.arrives(self.problem, self.X.view(self.problem.B, self.count, *self.X.shape[1:])).flatten()
@@ -189,7 +190,7 @@ class Candidates:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
         part, solver = self.of(rows), _refining(inner_solver(iterations, 0.1), refine.rounds)
         watched = None if self.watch is unwatched else lambda now: self.watch(now.finished, now.total)
-        call = Call.checked(part, at_rest_after(part, self.U[rows]), warm=take(multipliers, rows), callback=watched)
+        call = Call.within(part, at_rest_after(part, self.U[rows]), take(multipliers, rows), watched)
         end, made = solver.improved(call)
         good = (end.violation <= refine.violation) & seen.arrives(part, end.X)
         good &= chord_clearance(part, end.X, refine.cut) >= 0.0

@@ -179,7 +179,7 @@ class Follow:
             penalty = attraction(center, path, at, candidates.R[problem], weight, self.tube)
             for _ in range(ROUNDS):
                 candidates = candidates.solved(inner_solver(self.iterations), self.obstacles, penalty, place)
-                candidates = replace(candidates, live=candidates.live & ~candidates.arrive())
+                candidates = replace(candidates, live=candidates.live & ~candidates.arrive)
                 if not bool(candidates.live.any()):
                     break
             candidates = replace(candidates, live=live)

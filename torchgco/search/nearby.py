@@ -110,6 +110,10 @@ def among_nearby(call: Call, solve: Callable[[Call], Solution]) -> Solution:
 
 def without_obstacles(problem: Problem) -> Problem | None:
     """The problems with one absent obstacle of each kind, in the same native form; None for kinds that can't say."""
+    return problem.derive("without obstacles", lambda: _without_obstacles(problem))
+
+
+def _without_obstacles(problem: Problem) -> Problem | None:
     if any(type(part.inscribed).chosen is Obstacles.chosen for part in problem.obstacles):
         return None
     none = torch.full((problem.B, 1), -1, dtype=torch.int64, device=problem.x0.device)

@@ -25,7 +25,7 @@ from torchgco.base.errors import InputError
 from torchgco.base.options import Count, Natural, Positive
 from torchgco.base.shapes import computing_on
 from torchgco.base.tree import put, take
-from torchgco.kernels import cost_unit, current_device, open_loop, value
+from torchgco.kernels import cost_scale, current_device, open_loop, value
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.problem import Problem
@@ -252,7 +252,7 @@ class PathProposals(Row):
         live = paths.live.repeat_interleave(starts.shape[1], dim=1)
         candidates = Candidates.begin(problem, starts.repeat(1, K, 1, 1), paths.R, paths.unit, live, watch)
         tracked = follow.track(candidates, paths, free)
-        relaxed, sound = self.relax(tracked.pick(tracked.order(tracked.arrive())[:, : self.relax_top]))
+        relaxed, sound = self.relax(tracked.pick(tracked.order(tracked.arrive)[:, : self.relax_top]))
         order = relaxed.order(sound, SAME_COST)[:, : self.refine.top]
         picked = sound[relaxed.rows(order).flatten()]
         refined = relaxed.pick(order).refined(picked, self.refine, follow.iterations)
@@ -270,11 +270,11 @@ class PathProposals(Row):
         if self.relax_iterations > 0:
             relaxed = candidates.solved(inner_solver(self.relax_iterations), CANDIDATE_PENALTY)
             # A candidate that falls back into the trap, where waiting is cheaper, stays as tracked.
-            keeps = (relaxed.arrive() | ~candidates.arrive()).view(-1, 1, 1)
+            keeps = (relaxed.arrive | ~candidates.arrive).view(-1, 1, 1)
             X, U = torch.where(keeps, relaxed.X, candidates.X), torch.where(keeps, relaxed.U, candidates.U)
             candidates = replace(relaxed, X=X, U=U)
         shallow = candidates.penetration() <= self.max_penetration * candidates.R
-        return candidates, candidates.live & candidates.arrive() & shallow
+        return candidates, candidates.live & candidates.arrive & shallow
 
 
 class Part:
@@ -313,26 +313,22 @@ class Part:
 
     def _sought(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
         """`seek`."""
+        scene, known = self.scene, list[tuple[Tensor, Tensor]]()
+        assert scene is not None
         with computing_on(self.rest.device):
-            return self._sought_here(rows, roadmaps, count)
-
-    def _sought_here(self, rows: Tensor, roadmaps: Sequence[Roadmap], count: int) -> Paths:
-        assert self.scene is not None
-        R, unit = (scale[rows] for scale in self.scales)
-        usable, known = torch.isfinite(unit) & (unit > 0), []
-        found = torch.zeros_like(usable)
-        for number, roadmap in enumerate(roadmaps):
-            if any(roadmap.repeats(other, self.scene) for other in roadmaps[:number]):
-                continue
-            corners, arrives = paths_through(roadmap, self.scene, count, rows, self.known)
-            known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
-            found = found | (arrives & usable)
-        corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
-        obstacles = self.scene.obstacles
-        obstacles = obstacles if rows.numel() == self.problem.B else take(obstacles, rows)
-        label = classes(corners, obstacles)
-        first = label == torch.arange(label.shape[1], device=label.device)
-        return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
+            R, unit = (scale[rows] for scale in self.scales)
+            usable, found = torch.isfinite(unit) & (unit > 0), torch.zeros_like(rows, dtype=torch.bool)
+            for number, roadmap in enumerate(roadmaps):
+                if any(roadmap.repeats(other, scene) for other in roadmaps[:number]):
+                    continue
+                corners, arrives = paths_through(roadmap, scene, count, rows, self.known)
+                known.append((corners, (arrives & usable).unsqueeze(-1).expand(-1, count)))
+                found = found | (arrives & usable)
+            corners, live = (torch.cat(parts, dim=1) for parts in zip(*known, strict=True))
+            obstacles = scene.obstacles if rows.numel() == self.problem.B else take(scene.obstacles, rows)
+            label = classes(corners, obstacles)
+            first = label == torch.arange(label.shape[1], device=label.device)
+            return Paths(corners, label, first & live, R, torch.where(found, unit, 1.0), obstacles)
 
     def note(self, rows: Tensor, paths: Paths, refine: Refine, *steps: Any) -> None:
         """Record a comparison for the problems in `rows`; see `comparison`."""
@@ -357,7 +353,7 @@ class Part:
         bare = without_obstacles(self.problem.take(rows)) if rows.numel() > 0 else None
         if bare is None or len(bare.constraints) == len(bare.obstacles):
             return least
-        end = WITHOUT_OBSTACLES.solved(Call.checked(bare, self.rest[rows]))
+        end = WITHOUT_OBSTACLES.solved(Call.within(bare, self.rest[rows]))
         self.proposal.iterations[rows] += end.iterations
         return torch.where(end.best.violation <= ADMITTED, end.best.cost, least)
 
@@ -373,7 +369,7 @@ class Round:
         places: Tensor | None = None,
         record: SearchRecord | None = None,
     ) -> None:
-        self.watch, self.unit = watch, cost_unit(problem)
+        self.watch, self.unit = watch, cost_scale(problem).unit
         self.problem, scaled = problem, problem.in_cost_units()
         self.rest = problem.cost.rest_controls(problem.x0.new_zeros(problem.B, problem.N, problem.m))
         everyone = torch.arange(problem.B, device=problem.x0.device)

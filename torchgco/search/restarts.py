@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 from torchgco.base.errors import InputError
@@ -130,7 +130,7 @@ class Restarts(Solver):
         local = replace(self.local, guidance=None, max_outer_iterations=rounds)
         return replace(self, passes=passes), local.in_closed_loop(rounds)[1]
 
-    @property
+    @cached_property
     def _finishes(self) -> bool:
         """Whether a pass is the interior point's: in closed loop there is none, and no time for a verdict."""
         return any(isinstance(one, Converge) for one in self.passes.steps)
@@ -218,13 +218,15 @@ class Restarts(Solver):
     def _run(self, search: Search, passes: Sequence[Row | None]) -> None:
         """All passes, until the time is over; and in the last, what was sound before it is looked at again."""
         begun: tuple[int, str] | None = None
+        watched = search.record is not None or search.call.callback is not None
         for number, (name, one) in enumerate(zip(self.passes.names, passes, strict=True), start=1):
             if search.begun and search.call.late:
                 break
-            if begun is not None:
-                search.end_pass(*begun)
-            begun = number, name
-            search.next_pass(*begun)
+            if watched:
+                if begun is not None:
+                    search.end_pass(*begun)
+                begun = number, name
+                search.next_pass(*begun)
             with suppress(Late):
                 if one is not None:
                     one.run(search)

@@ -97,6 +97,8 @@ class Best:
 
     def keep(self, rows: Tensor, new: SolveEnd) -> None:
         """Keep the better of the old and the new trajectories of `rows`: arrived, then feasible, then cheapest."""
+        if rows.numel() == 0:
+            return
         problem, limit = self.call.problem.take(rows), self.solver.violation_tolerance
         old = self.of(rows)
         preferred = is_preferred(problem, new.best, old.best, limit)

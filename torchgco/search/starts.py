@@ -11,7 +11,7 @@ search takes. Its results compete with the search's by cost, at the end; they sp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import ClassVar, Literal
 
 import torch
@@ -36,6 +36,7 @@ from torchgco.search.tube import pursue
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.convexity import KNOTS, STREAM, controls_of, half_ranges
 from torchgco.solvers.ending import STATIONARY
+from torchgco.solvers.interior import InteriorPoint
 
 START_ROUNDS = 2  # one guess turns a car round between walls in 2 of 5 cases: all of 8 miss in 1.7 %, of 16 in 0.03 %
 
@@ -269,6 +270,11 @@ def _driven(problem: Problem, U: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
 
 
+@lru_cache(maxsize=64)
+def _from_caught(solver: InteriorPoint) -> InteriorPoint:
+    return replace(solver, initial_barrier=FROM_CAUGHT)
+
+
 @dataclass(frozen=True)
 class Direct(Row):
     """Solves caught problems by the interior point too; the results are compared with the search's at its end.
@@ -320,7 +326,7 @@ class Direct(Row):
         if left.numel() > 0:
             start = take(search.caught.last, rows[left])
             call = replace(call.take(left), U0=start.U)
-            solver = replace(solver, initial_barrier=FROM_CAUGHT)
+            solver = _from_caught(solver)
             left = left[self._compared(search, rows[left], call, solver.solved(call, start.X), bound[left])]
         if left.numel() > 0:
             pursue(search, rows[left])
@@ -338,11 +344,13 @@ class Direct(Row):
             serves &= has_arrived(call.problem, end.best.X)
         quick = serves & (end.best.cost <= bound + self.gap * bound.abs())
         enough, left = quick.nonzero().flatten(), (~quick).nonzero().flatten()
-        search.best.keep(rows[enough], take(end, enough))
+        if enough.numel() > 0:
+            search.best.keep(rows[enough], take(end, enough))
         search.best.end.iterations[rows[left]] += end.iterations[left]  # now, and not once more at the end
         search.best.worked[rows] = True
-        waits = take(end, left)
-        search.waiting.append((rows[left], replace(waits, iterations=torch.zeros_like(waits.iterations))))
+        if left.numel() > 0:
+            waits = take(end, left)
+            search.waiting.append((rows[left], replace(waits, iterations=torch.zeros_like(waits.iterations))))
         return left
 
 

@@ -14,7 +14,7 @@ import torch
 from torchgco.base.options import Count, Natural
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
-from torchgco.kernels import cost_unit
+from torchgco.kernels import cost_scale
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.lagrangian.quality import goal_tolerance
 from torchgco.problem.problem import Problem
@@ -200,4 +200,4 @@ def _goal_region(problem: Problem) -> GuideRegion:
     radius = problem.x0.new_full((problem.B, problem.N + 1), torch.inf)
     radius[:, -1] = size
     center = problem.goal.position.unsqueeze(1).expand(-1, problem.N + 1, -1).contiguous()
-    return GuideRegion(center, radius, ATTRACTION * cost_unit(problem) / size.pow(4), problem.position)
+    return GuideRegion(center, radius, ATTRACTION * cost_scale(problem).unit / size.pow(4), problem.position)

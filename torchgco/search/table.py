@@ -63,6 +63,7 @@ class Passes(tuple[Row, ...]):
     """
 
     names: tuple[str, ...]
+    steps: tuple[Row, ...]  # of all rows
 
     def __new__(cls, rows: Mapping[str, Row] | Iterable[Row] = ()) -> Self:
         if isinstance(rows, Mapping):
@@ -73,6 +74,7 @@ class Passes(tuple[Row, ...]):
             names = list(known or _named(rows))
         made = super().__new__(cls, rows)
         made.names = tuple(names)
+        made.steps = tuple(step for row in made for step in row.steps)
         return made
 
     def __reduce__(self) -> tuple[type[Passes], tuple[dict[str, Row]]]:
@@ -112,11 +114,6 @@ class Passes(tuple[Row, ...]):
             self[name]
         both = ((name, rows.get(name, row) if name in rows else row) for name, row in self.items())
         return Passes({name: row for name, row in both if row is not None})
-
-    @property
-    def steps(self) -> tuple[Row, ...]:
-        """The steps of all rows."""
-        return tuple(step for row in self for step in row.steps)
 
 
 def passes_of(value: Any) -> Passes:

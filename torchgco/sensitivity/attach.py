@@ -118,7 +118,7 @@ def refuse_forms(problem: Problem, what: str) -> None:
 
 def _captures(problem: Problem) -> bool:
     """Whether values of users' functions lead to tensors that ask for gradients, as those of the first problem show."""
-    if not any(map(is_users, (problem.dynamics, problem.cost, *problem.constraints))):
+    if not problem.users:
         return False
     single = problem.take(slice(0, 1))
     model, (X, U) = single.along, (z.detach() for z in single.at_rest)

@@ -24,7 +24,7 @@ from torchgco.base.gradients import not_recording
 from torchgco.base.status import SOLVED, Status
 from torchgco.base.status import Differentiability as Why
 from torchgco.base.tree import copied, put, take
-from torchgco.kernels import chord_clearance, cost_unit, interior_of, measured
+from torchgco.kernels import chord_clearance, cost_scale, interior_of, measured
 from torchgco.lagrangian.kkt import KktSolve, RightSides
 from torchgco.lagrangian.quality import leaves_goal
 from torchgco.problem.problem import Problem
@@ -152,7 +152,10 @@ def clearance(problem: Problem, X: Tensor) -> Tensor:
 
 def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor]:
     """Which rows hold as equalities, and of which inequalities that isn't known, (B, R) bool."""
-    unit, none = cost_unit(problem).view(-1, 1, 1), torch.zeros_like(solution.status, dtype=torch.bool)[:, None][:, :0]
+    unit, none = (
+        cost_scale(problem).unit.view(-1, 1, 1),
+        torch.zeros_like(solution.status, dtype=torch.bool)[:, None][:, :0],
+    )
     hold, untold = [none], [none]
     for constraint, lam in zip(problem.constraints, solution.multipliers.lam, strict=True):
         slack, pushes = -constraint.value(solution.X, solution.U), lam / unit

@@ -134,6 +134,8 @@ class OuterLoop:
         # As printed, only the outer limit ends a solve, mu always grows, and inequalities have the printed form.
         self.as_printed = self.solver.inner.as_printed
         self.limit = 1 if self.recorder is not None else self.solver.inner.max_iterations
+        # Whether guidance is asked after every pass.
+        self._guided = self.guidance is not None and not isinstance(self.guidance, StopWhenCaught)
 
     @property
     def result(self) -> SolveEnd:
@@ -206,11 +208,6 @@ class OuterLoop:
                 settled=SETTLED,
             )  # fmt: skip
         return self._passes
-
-    @property
-    def _guided(self) -> bool:
-        """Whether guidance is asked after every pass."""
-        return self.guidance is not None and not isinstance(self.guidance, StopWhenCaught)
 
     def _by_passes(self, passes: NativeOuter, s: State) -> Tensor:
         """As `advance`: with one call of the kernels for all of it where nothing else has to look on."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
@@ -21,7 +21,7 @@ from torchgco.base.shapes import check_shape, check_tensor, check_untransformed,
 from torchgco.base.status import Status
 from torchgco.base.tree import Rows, take
 from torchgco.explaining.explain import Account
-from torchgco.kernels import copied_to, cost_unit, current, interior_of, is_mixed, kernels_of, on_cpu, served_by, used
+from torchgco.kernels import copied_to, cost_scale, current, interior_of, is_mixed, kernels_of, on_cpu, served_by, used
 from torchgco.lagrangian.lagrangian import Multipliers
 from torchgco.lagrangian.penalties import GuideRegion
 from torchgco.problem.alone import check_rows
@@ -101,16 +101,22 @@ class Call:
         check_value(callback, Callable | None, "callback")
         deadline = None if max_seconds is None else clock.seconds() + max_seconds
         problem.check_controls(U0)
-        rows = torch.arange(problem.B, device=problem.x0.device)
-        if ids is None:
-            ids = rows
-        else:
+        if ids is not None:
             check_ids(ids, problem)
         if warm is not None:
             if not isinstance(warm, Multipliers):
                 raise InputError("warm", "Multipliers, such as those of a solution", type(warm).__name__)
             warm.check(problem)
-        return cls(current(problem), U0, seed, ids, rows, torch.zeros_like(rows), warm, callback, deadline)
+        made = cls.within(current(problem), U0, warm, callback)
+        return replace(made, seed=seed, ids=made.ids if ids is None else ids, deadline=deadline)
+
+    @classmethod
+    def within(
+        cls, problem: Problem, U0: Tensor, warm: Multipliers | None = None, callback: Callback | None = None
+    ) -> Call:
+        """A call within another solve, of what that has made."""
+        rows = torch.arange(problem.B, device=problem.x0.device)
+        return cls(problem, U0, 0, rows, rows, torch.zeros_like(rows), warm, callback)
 
     @property
     def late(self) -> bool:
@@ -133,7 +139,7 @@ class Call:
 
     def in_cost_units(self) -> tuple[Self, Tensor]:
         """The same call with costs and multipliers in units of `Problem.cost_unit`, and these units (B,)."""
-        unit = cost_unit(self.problem)
+        unit = cost_scale(self.problem).unit
         warm = None if self.warm is None else self.warm.scaled(1.0 / unit)
         return replace(self, problem=self.problem.in_cost_units(), warm=warm), unit
 
@@ -212,32 +218,25 @@ class Solver(Brief, Checked):
 
         def run(problem: Problem) -> Solution:
             left = None if ends is None else max(LEAST_SECONDS, ends - clock.seconds())
-            return self._found(problem, U0, seed, ids, warm, callback, left, X0)
+            options = {"seed": seed, "ids": ids, "callback": callback, "max_seconds": left}
+            return self._found(problem, U0, warm, X0, options)
 
         return spared(problem, run)
 
     def _found(
-        self,
-        problem: Problem,
-        U0: Tensor,
-        seed: int,
-        ids: Tensor | None,
-        warm: Multipliers | None,
-        callback: Callback | None,
-        max_seconds: float | None,
-        X0: Tensor | None,
+        self, problem: Problem, U0: Tensor, warm: Multipliers | None, X0: Tensor | None, options: Mapping[str, Any]
     ) -> Solution:
-        """`solve`."""
+        """`solve`, with further arguments of `Call.checked`."""
         with computing_on(problem.x0.device):
             if problem.B == 0:  # nothing to trace code with
-                Call.checked(problem, U0, seed, ids, warm, callback, max_seconds)
+                Call.checked(problem, U0, warm=warm, **options)
                 return replace(Solution.empty(problem), account=Account(problem, self))
             if X0 is not None:
                 check_states(X0, problem)
             problem.check_controls(U0)
             problem = _without_starts(problem, U0, X0)
             whole = for_solvers(problem, self.joins_knots)
-            made = partial(Call.checked, whole, seed=seed, ids=ids, callback=callback, max_seconds=max_seconds)
+            made = partial(Call.checked, whole, **options)
             if problem.time is not None:
                 return self._in_time(problem, whole, U0, warm, X0, made)
             if problem.horizon is not None:

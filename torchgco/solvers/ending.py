@@ -16,7 +16,7 @@ from torch import Tensor
 from torchgco.base.status import STALLED, UNMOVED, Status, is_over
 from torchgco.ilqr.riccati import BackwardPass
 from torchgco.judging.gates import passages
-from torchgco.kernels import cost_scale, cost_unit, kernels_of, measured, path_clearance
+from torchgco.kernels import cost_scale, kernels_of, measured, path_clearance
 from torchgco.lagrangian.lagrangian import Lagrangian, PassEnd, State, binding
 from torchgco.obstacles.base import ADMITTED
 from torchgco.problem.horizons import as_solved
@@ -60,7 +60,7 @@ def optimality(lagrangian: Lagrangian, X: Tensor, U: Tensor, cost: Tensor | None
         # Where a control costs nothing, or rounding spoils the Hessian, regularisation still gives gains.
         if not bool(step.failed.any()):
             break
-        mu = torch.where(step.failed, FIRST * STRONGER**i * cost_unit(problem), mu)
+        mu = torch.where(step.failed, FIRST * STRONGER**i * cost_scale(problem).unit, mu)
         step = _merged(step, run(mu))
     saved = -step.expected_change(torch.ones_like(slack)) + slack
     _, constant, least = cost_scale(problem)
@@ -79,7 +79,7 @@ def _rounds(lagrangian: Lagrangian, X: Tensor, U: Tensor) -> Tensor:
     """Where rounding of the rows' stiffness hides curvatures of the cost, (B,): states or controls have small units."""
     size = torch.cat((X.flatten(1), U.flatten(1)), dim=1).abs().amax(-1)
     stiffness = torch.finfo(X.dtype).eps * lagrangian.multipliers.mu * size.square()
-    hides = stiffness > HIDES * cost_unit(lagrangian.problem)
+    hides = stiffness > HIDES * cost_scale(lagrangian.problem).unit
     return hides & _binds(lagrangian, X, U) if bool(hides.any()) else hides
 
 
@@ -107,7 +107,7 @@ def _by_slopes(problem: Problem, run: Callable[[Tensor], BackwardPass], sizes: T
     what the controls could still save. With as much as numbers can hold, squares included, steps are along the slopes,
     and so short that no stage feels another's.
     """
-    mu = torch.finfo(sizes.dtype).max ** 0.5 * cost_unit(problem).clamp(max=1.0)
+    mu = torch.finfo(sizes.dtype).max ** 0.5 * cost_scale(problem).unit.clamp(max=1.0)
     slopes = run(mu).gains[..., -1].movedim(0, 1).abs() * mu.view(-1, 1, 1)
     return (slopes * sizes.unsqueeze(1)).contiguous().sum(-1).sum(-1)
 

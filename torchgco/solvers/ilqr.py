@@ -51,7 +51,7 @@ class ILQR(Solver, named="ilqr"):
     max_iterations: Count = 50
     line_search: LineSearch = LineSearch()
 
-    @property
+    @cached_property
     def descent(self) -> Descent:
         """The options as kernels read them."""
         return Descent(self.line_search, self.tolerance, self.max_iterations, self.as_printed)

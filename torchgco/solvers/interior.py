@@ -15,7 +15,6 @@ from torchgco.ilqr.riccati import backward
 from torchgco.kernels import (
     at_once,
     cost_scale,
-    cost_unit,
     expect_interior,
     interior_of,
     measured,
@@ -53,7 +52,7 @@ def least_violated(call: Call, end: SolveEnd, tolerance: float) -> SolveEnd:
     if rows.numel() == 0 or call.late:
         return end
     problem, old = call.problem.take(rows).held_at(end.best.X[rows, 0]), take(end.best, rows)
-    cost_unit(problem)
+    cost_scale(problem)
     multipliers = Multipliers.zero(problem, HEAVY)
     repaired, ended = descend(REPAIR, Lagrangian(problem.in_cost_units(), multipliers, None, phr=True), old.U)
     X, U, violation = repaired.X, repaired.U, measured(problem, repaired.X, repaired.U)
@@ -173,11 +172,10 @@ class InteriorPoint(Solver, named="solver"):
     def run(self, call: Call) -> Solution:
         """Solve a checked call."""
         session, admitted = Session(call, own_units=True), self.admitted(call.problem)
-        interior_of(session.call.problem)  # or an error that says what is missing
-        guess = guessed(session.call) if session.call.X0 is None else None
-        end = self.solved(session.call, guess=guess, escapes=True)
+        kernels = interior_of(session.call.problem)  # or an error that says what is missing
+        end = self.solved(session.call, escapes=True, kernels=kernels)
         if not bool(is_over(end.status).all()):
-            end = self.no_worse(session.call, guess or guessed(session.call), end)
+            end = self.no_worse(session.call, guessed(session.call), end)
         return session.finished(least_violated(session.call, end, admitted), admitted)
 
     def admitted(self, problem: Problem) -> float:
@@ -210,6 +208,7 @@ class InteriorPoint(Solver, named="solver"):
         guess: Iterate | None = None,
         smoothing: float = 0.0,
         escapes: bool = False,
+        kernels: InteriorKernels | None = None,
     ) -> SolveEnd:
         """The solve without its verdict, in the units of the call.
 
@@ -221,17 +220,17 @@ class InteriorPoint(Solver, named="solver"):
             escapes: where the conditions of first order hold but the cost falls to second order, as at an equilibrium
                 that a guess at rest never leaves, solve again from beside, and keep what costs less, or falls without
                 end.
+            kernels: `interior_of` the call's problems, where they are known.
         """
         problem, X0 = call.problem, call.X0 if X0 is None else X0
         try:
-            kernels = interior_of(problem)
+            kernels = kernels or interior_of(problem)
         except NativeError:  # no compiler: a search goes on with what its other solver finds
             end = SolveEnd.blank(problem, call.U0)
             end.status[:] = int(Status.MAX_ITERATIONS)
             return replace(end, best=guess or guessed(call))
         if X0 is None:
-            guess = guess or guessed(call)
-            X = guess.X
+            X = open_loop(problem, call.U0) if guess is None else guess.X
         else:
             X = torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
 from torchgco.base.tree import Rows, is_users, put, spread, take
+from torchgco.constraints.base import Constraint
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import kernels_of, measured, reproducible
 from torchgco.lagrangian.lagrangian import Iterate, Lagrangian, SolveEnd
@@ -123,7 +124,7 @@ class Session:
         if rows.numel() > 0:
             X, U = reproducible(self.call.problem, X, U, rows, gains[rows, ..., :-1])
         cost = best.cost if rows.numel() == 0 and self._own_costs else user.cost.total(X, U)
-        if any(map(is_users, user.constraints)):
+        if any(isinstance(part, Constraint) for part in user.users):
             worst = violation(user.constraints, X, U)
         elif rows.numel() > 0:
             worst = measured(self.call.problem, X, U)

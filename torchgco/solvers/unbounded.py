@@ -8,7 +8,7 @@ from torch import Tensor
 from torchgco.base.autodiff import gradients_at_once
 from torchgco.base.draws import uniform
 from torchgco.dynamics.rollout import open_loop as rolled_out
-from torchgco.kernels import cost_scale, cost_unit, measured, open_loop
+from torchgco.kernels import cost_scale, measured, open_loop
 from torchgco.lagrangian.lagrangian import Iterate
 from torchgco.problem.problem import Problem
 from torchgco.solvers.ending import STATIONARY
@@ -62,7 +62,7 @@ def falls_without_end(problem: Problem, U0: Tensor, best: Iterate, left: Tensor,
     where the cost lies deep below that of the guess, for this may also be a reward that ends, such as one at wide
     bounds; where a Newton step would still save a share `left` (B,) of the cost; and where controls have gone very far.
     """
-    unit = problem.N * cost_unit(problem)
+    unit = problem.N * cost_scale(problem).unit
     way = (best.U - U0).abs().flatten(1).amax(-1) / (1.0 + U0.abs().flatten(1).amax(-1))
     open_ended = (left > STATIONARY) | (way >= FAR_CONTROLS)
     violated = beyond_rounding(problem.held_at(best.X[:, 0]), best.U, best.violation, OF_A_RAY)

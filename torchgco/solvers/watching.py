@@ -50,6 +50,8 @@ class Watcher:
 
     def end(self, solution: Solution) -> None:
         """Show how the problems ended."""
+        if not self.verbose:
+            return
         counts = Counter(status.name for status in solution.statuses).most_common()
         ended = ", ".join(f"{count} {status}" for status, count in counts)
         iterations = f"{int(solution.iterations.median())} iterations in the median, " if self.B else ""

@@ -144,12 +144,12 @@ class Facts:
     def same(self, thing: Any) -> None:
         """A fact by identity."""
         self.alive.append(thing)
-        self.note(id(thing))
+        self._found.append((id(thing),))
 
     def _first(self, thing: Any) -> bool:
         """Whether the walk comes here for the first time; a fact in itself."""
         index = self._met.setdefault(id(thing), len(self._met))
-        self.note(type(thing), index)
+        self._found.append((type(thing), index))
         is_new = index == len(self._passed)
         if is_new:
             self._passed.append(thing)

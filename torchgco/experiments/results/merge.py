@@ -142,7 +142,8 @@ def _clusters(
     seeds = [(seed, code) for table, code in zip(tables, values_of, strict=True) for seed in table["seed"].unique()]
     if len(set(seeds)) == len(seeds):
         return [None] * len(runs)  # no two runs have layouts in common
-    of_run = [_digests(table).assign(cell=code) for table, code in zip(tables, values_of, strict=True)]
+    known = (table.loc[table["layout_digest"].notna(), ["layout", "seed", "layout_digest"]] for table in tables)
+    of_run = [layouts.assign(cell=code) for layouts, code in zip(known, values_of, strict=True)]
     layouts = [rows for rows in of_run if len(rows)]
     if not layouts or not pd.concat(layouts).drop_duplicates().duplicated(["layout", "seed", "cell"]).any():
         return [None] * len(runs)  # nearly always: nothing to distinguish
@@ -158,12 +159,6 @@ def _clusters(
             clusters.append((run.folder.as_posix(), digests, values))
     split = [sum(theirs == values for *_, theirs in clusters) > 1 for *_, values in clusters]
     return [clusters[number][0] if split[number] else None for number in numbers]
-
-
-def _digests(trials: pd.DataFrame) -> pd.DataFrame:
-    """The known layouts of some trials: columns layout, seed and layout_digest."""
-    names = ["layout", "seed", "layout_digest"]
-    return trials.loc[trials["layout_digest"].notna(), names]
 
 
 def _kind(values: Sequence[Any]) -> str:

@@ -54,7 +54,7 @@ def current_device() -> OnDevice | None:
 def at_once(most: int) -> int:
     """How many problems are worked on together: `most`, which bounds memory and the time between two reports; where a
     device serves, with a thread for each, more."""
-    return most if current_device() is None else max(most, AT_ONCE)
+    return most if _device.get() is None else max(most, AT_ONCE)
 
 
 @contextmanager
@@ -134,7 +134,7 @@ class Kernel:
 
     def _run(self, argument: Any, first: int, last: int) -> None:
         if isinstance(argument, c.Problem):
-            argument = problem = argument.copy({"replicas": 1})  # a thread has a single lane
+            argument = problem = argument.fill({"replicas": 1}, copied=True)  # a thread has a single lane
         else:
             problem = c.Problem.from_address(argument.of)
         room = getattr(self.library.host, self.library.program.room_of(self.name))
