@@ -65,7 +65,7 @@ export class Flights {
   }
 
   built(flight) {
-    const { name, colour } = this.head.solvers[flight.solver];
+    const { name, seen: colour } = this.head.solvers[flight.solver];
     const group = new THREE.Group();
     const points = this.points(flight.path);
     const paint = new THREE.MeshLambertMaterial({ color: colour });
