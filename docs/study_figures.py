@@ -18,8 +18,8 @@ from benchmarks.picture import take
 from torchgco.experiments.reports.report import main as report
 
 FIGURES = Path(__file__).resolve().parent / "figures"
-SHOWN, SWEPT = 6, 32  # layouts of the study and of each study of the sweep
-WIDTH, COLOURS = 1000, 48  # pixels, and colours that a picture is reduced to: it takes a fifth of the bytes
+SHOWN, SWEPT = 6, 16  # layouts of the study and of each study of the sweep
+WIDTH, COLOURS = 1000, 128  # pixels, and colours that a picture is reduced to: it takes a fifth of the bytes
 PAGE = (1000, 620)
 
 
@@ -34,7 +34,7 @@ def draw(output: Path, shown: int = SHOWN, swept: int = SWEPT) -> None:
             reduce(Path(folder) / "page.png", output / "study-page.png")
         except FileNotFoundError as error:
             print(f"study-page.png is left as it is: {error}", file=sys.stderr)
-        obstacles = "scenario.num_obstacles=10,30,60,90"
+        obstacles = "scenario.num_obstacles=10,30,60"
         torchgco("-m", obstacles, f"study.layouts={swept}", "study.figures=false", f"hydra.sweep.dir={sweep}")
         report([str(sweep), "--format", "csv"])
         (drawn,) = (sweep / "report" / "figures").glob("rates-*.png")
@@ -47,7 +47,7 @@ def reduce(picture: Path, output: Path) -> None:
     with Image.open(picture) as whole:
         size = (WIDTH, round(WIDTH * whole.height / whole.width))
         small = whole.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-    small.quantize(COLOURS, dither=Image.Dither.NONE).save(output, optimize=True)
+    small.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(output, optimize=True)
 
 
 def main(words: Sequence[str] | None = None) -> int:
