@@ -45,6 +45,15 @@ def figures() -> list[Figure]:
     ]
 
 
+def test_ratios_near_1_are_written_whole() -> None:
+    figure = figures()[0]
+    figure.draw_without_rendering()
+    axis = figure.axes[-1].yaxis
+    axis.axes.set_ylim(1.0, 1.0006)
+    figure.draw_without_rendering()
+    assert axis.get_offset_text().get_text() == ""
+
+
 def test_lines_of_solvers_have_their_dashes_and_the_legend_shows_them() -> None:
     for figure in figures():
         handles = {

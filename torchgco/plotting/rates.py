@@ -104,6 +104,7 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
                 middle, high = (group[name].to_numpy(dtype=float) for name in effort[:2])
                 (_line if numeric else _points)(row[-1], x, middle, middle, high, colours[solver], side)
                 row[-1].set_ylabel(effort[2])
+                row[-1].ticklabel_format(axis="y", useOffset=False)  # ratios as they are, not what they exceed 1 by
         for ax, name in zip(row, shown, strict=False):
             _as_rate(ax, name)
         for ax in row:
