@@ -39,9 +39,8 @@ KNOWN: dict[str, str] = {
     "gco_exact": "#88CCEE", "gco_max": "#332288", "multistart": "#999933", "fatrop_guided": "#117733",
     "path_pursuit": "#CC6677",
 }  # fmt: skip
-Dash = str | tuple[float, tuple[float, ...]]
 # Each colour has its dash, so that colours that colour-blind readers may take for each other have different ones.
-DASHES: dict[str, Dash] = {
+DASHES: dict[str, Any] = {
     colour: dash
     for dash, colours in {
         "-": (PALETTE[0], PALETTE[6], "#88CCEE", "#CC6677"), (0, (5, 1.5)): (PALETTE[1], "#44AA99"),
