@@ -11,7 +11,7 @@
 # make benchmark   speed, compared with the peers (twenty minutes; ARGS="families targets" for some sections);
 #                  benchmark-gpu: kernels' bits and speed on a GPU (ten minutes), then the same there
 # make docs    the API reference from the docstrings, in docs/api; site: the manual with it and a search, as a site in build/site;
-#              dist: sdist and wheel, in dist (docs/releasing.md); make figures: the figures of docs/algorithm.md;
+#              dist: sdist and wheel, in dist (docs/releasing.md); make figures: those of docs/algorithm.md and studies.md;
 #              make paper: the paper's figures, tables and missions by our solvers, in benchmarks/results/paper.md
 # make test    the tests; test-all: also the tests that kill processes or fly whole studies; test-slurm: those that start a
 #              SLURM on this machine (as root; needs Debian's slurm-wlm and munge); robustness: those of wrong input, kills and
@@ -119,6 +119,7 @@ dist: $(DEV)
 
 figures: $(RUNTIME)
 	$(BIN)/python docs/figures.py
+	$(BIN)/python docs/study_figures.py
 
 paper: $(RUNTIME)
 	$(BIN)/python -m benchmarks.paper $(ARGS)

@@ -320,6 +320,17 @@ def test_the_figures_of_the_algorithm_are_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(find_compiler() is None, reason="studies in PyTorch alone take minutes")
+def test_the_pictures_of_studies_are_drawn_and_small(tmp_path: Path) -> None:
+    assert program("study_figures").main(["--output", str(tmp_path), "--layouts", "2", "2"]) == 0
+    shown = {link for link in links(ROOT / "docs" / "studies.md") if link.startswith("figures/")}
+    drawn = {f"figures/{path.name}" for path in tmp_path.iterdir()}
+    assert drawn | {"figures/study-page.png"} == shown, "the page where there is a Chromium"
+    for link in shown:
+        assert (ROOT / "docs" / link).stat().st_size < 150e3, link
+
+
+@pytest.mark.slow
 def test_the_api_reference_opens_with_the_public_names(tmp_path: Path) -> None:
     """Without a warning of pdoc, such as one of a type that it doesn't find."""
     command = [sys.executable, str(ROOT / "docs" / "reference.py"), "--output", str(tmp_path)]

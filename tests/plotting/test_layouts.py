@@ -18,7 +18,7 @@ from torchgco.judging.contact import BETWEEN
 from torchgco.plotting.bodies import Ball, Box, bodies
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.scene import contacts, scene_of
-from torchgco.plotting.style import solver_colours, solver_dash
+from torchgco.plotting.style import DASHES, solver_colours
 from torchgco.scenarios import Mazes
 
 MARKS = {"X": "contact", "o": "short", "D": "infeasible"}
@@ -101,7 +101,7 @@ def test_the_studied_solver_is_drawn_over_the_others_each_with_its_look() -> Non
     colours = solver_colours(["gco", "mine"])
     assert (above.get_color(), below.get_color()) == (colours["gco"], colours["mine"])
     assert above.get_linewidth() < below.get_linewidth(), "one of the same course shows at its sides"
-    expected = Line2D([], [], linestyle=solver_dash("mine"), linewidth=below.get_linewidth())
+    expected = Line2D([], [], linestyle=DASHES[colours["mine"]], linewidth=below.get_linewidth())
     assert below._dash_pattern == expected._dash_pattern
 
 

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.plotting.colours import GRAPHIC, TEXT, contrast
 from tests.view.browser import Tab
 from tests.view.scenes import DT, SOLVERS, UNEVEN, WORDS, N, document, trajectories
-from torchgco.plotting.style import solver_colours
+from torchgco.plotting.style import KNOWN, PALETTE, solver_colours
 from torchgco.view.document import Line, SearchPart
 from torchgco.view.page import page
 
@@ -216,7 +217,8 @@ def test_the_hover_tells_what_is_under_the_pointer(tab: Tab) -> None:
     x, y = place(tab, trajectories()[SOLVERS[1]][0, 15].tolist())  # inside the sphere
     tab.mouse("mouseMoved", x, y)
     told = tab.wait("!document.getElementById('hover').hidden && document.getElementById('hover').innerText")
-    assert "al_ilqr, knot 15, t = 1.50 s" in told and f"status: {WORDS}" in told
+    assert told.startswith(f"layout 0 {WORDS}, al_ilqr: failed") and "knot 15, t = 1.50 s" in told
+    assert f"status: {WORDS}" in told and "cost: " in told
     assert "here violated: spheres by" in told
     tab.mouse("mouseMoved", 5, 5)
     assert tab.evaluate("document.getElementById('hover').hidden")
@@ -273,6 +275,72 @@ def test_light_and_dark(tab: Tab) -> None:
     dark = pixels(tab)
     assert light[:20].mean() > 200 > 80 > dark[:20].mean()
     assert tab.evaluate("getComputedStyle(document.body).color") == "rgb(232, 234, 237)"
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_every_solver_is_seen_before_what_is_behind_it(tab: Tab, dark: bool) -> None:
+    """On paper in the colours of figures, in the dark with the contrast that WCAG asks of graphics."""
+    tab.dark(dark)
+    ground = {False: "#e9ebee", True: "#20242a"}[dark]
+    tab.wait(f"torchgcoView.colours.ground === 0x{ground[1:]}")
+    for colour in dict.fromkeys([*KNOWN.values(), *PALETTE]):
+        tab.evaluate(f"torchgcoView.head.solvers[0].colour = {json.dumps(colour)}; torchgcoView.rebuild()")
+        swatch = "getComputedStyle(document.querySelector('.swatch')).backgroundColor.match(/\\d+/g).map(Number)"
+        line = "torchgcoView.flights.all[0].line.material.color.getHexString()"
+        shown, drawn = "#{:02x}{:02x}{:02x}".format(*tab.evaluate(swatch)), f"#{tab.evaluate(line)}"
+        assert shown == drawn and (contrast(drawn, ground) > 0.99 * GRAPHIC if dark else drawn == colour.lower())
+
+
+def test_layouts_differ_by_how_full_they_are_not_by_colour_alone(tab: Tab) -> None:
+    level = "(name) => { const chip = document.querySelector('#chips button'); chip.className = name; "
+    level += "return getComputedStyle(chip).backgroundImage.match(/(\\d+)%/)[1]; }"
+    assert [tab.evaluate(f"({level})('{name}')") for name in ("success", "reached", "feasible", "failed")] == [
+        "100", "66", "33", "0"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_all_words_can_be_read(tab: Tab, dark: bool) -> None:
+    tab.dark(dark)
+    tab.evaluate("document.querySelectorAll('.result').forEach((e, i) => { e.className = 'result ' + "
+                 "['success', 'reached', 'feasible', 'failed'][i % 4]; })")  # fmt: skip
+    check_readable(tab)
+    tab.evaluate("document.querySelectorAll('.result').forEach((e, i) => { e.className = 'result ' + "
+                 "['feasible', 'failed'][i % 2]; })")  # fmt: skip
+    check_readable(tab)
+
+
+def check_readable(tab: Tab) -> None:
+    """Assert that all words that are shown have the contrast to what is behind them that WCAG asks of text."""
+    script = """(() => { const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+      return [...document.querySelectorAll('body, body *')].filter((e) => e.getClientRects().length &&
+        [...e.childNodes].some((one) => one.nodeType === 3 && one.textContent.trim())).map((e) => {
+          const painted = (one) => parts(getComputedStyle(one).backgroundColor);
+          let behind = e;
+          while (behind && (painted(behind)[3] ?? 1) < 0.5) behind = behind.parentElement;
+          const ground = behind ? painted(behind) : null;
+          return [e.textContent.trim().slice(0, 40), parts(getComputedStyle(e).color), ground]; }); })()"""
+    told = tab.evaluate(script)
+    assert len(told) > 10
+    canvas = [18, 18, 18] if tab.evaluate("matchMedia('(prefers-color-scheme: dark)').matches") else [255] * 3
+    as_hex = lambda c: "#{:02x}{:02x}{:02x}".format(*(round(x) for x in c[:3]))
+    weak = [(text, ink, ground) for text, ink, ground in told if contrast(as_hex(ink), as_hex(ground or canvas)) < TEXT]
+    assert weak == []
+
+
+def test_a_finger_asks_by_a_tap(tab: Tab) -> None:
+    tab.click("#view-above")
+    x, y = place(tab, trajectories()[SOLVERS[1]][0, 15].tolist())
+    touch = {"enabled": True, "maxTouchPoints": 1}
+    try:
+        tab.call("Emulation.setTouchEmulationEnabled", **touch)
+        tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+        tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        assert "al_ilqr: failed" in tab.wait(
+            "!document.getElementById('hover').hidden && document.getElementById('hover').innerText"
+        )
+    finally:
+        tab.call("Emulation.setTouchEmulationEnabled", enabled=False)
 
 
 def test_nothing_of_the_data_ran(untouched: Tab) -> None:

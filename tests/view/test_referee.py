@@ -12,7 +12,7 @@ import pytest
 from benchmarks.families.board import BOARD
 from tests.referee.boards import HOSTILE, SHAPES, board, enter
 from tests.view.browser import Tab
-from tests.view.test_browser import check_quiet
+from tests.view.test_browser import check_quiet, check_readable
 from torchgco.experiments.referee.board import leaderboard
 
 ROWS = "[...document.querySelectorAll('section')[0].querySelectorAll('tbody tr')].filter((row) => !row.hidden)"
@@ -49,7 +49,14 @@ def test_rows_are_sorted_and_filtered(chromium: Callable[[], Tab], html: str, tm
         tab.dark(dark)
         tab.size(360, 640)
         assert tab.evaluate("document.documentElement.scrollWidth") <= 360
-        assert len(tab.screenshot()) > 1000
+        check_readable(tab)
+    tab.evaluate("(() => { const field = document.querySelector('input'); field.value = ''; "
+                 "field.dispatchEvent(new Event('input')); "
+                 "document.querySelector('.room').scrollLeft = 600; })()")  # fmt: skip
+    entry = tab.evaluate("(() => { const r = document.querySelector('td:nth-child(2)').getBoundingClientRect(); "
+                         "return [r.left, r.height, document.querySelector('.room').scrollLeft]; })()")  # fmt: skip
+    assert 0 <= entry[0] < 360 and entry[2] > 0, "whose row it is stays in sight"
+    assert entry[1] < 200, "long texts make rows wide, not tall"
     check_quiet(tab)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -10,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 from torchgco.obstacles.base import ADMITTED
-from torchgco.plotting.style import INK, legend, panels, solver_colours, tasks_of, tidy
+from torchgco.plotting.style import DASHES, INK, legend, panels, solver_colours, solver_handles, tasks_of, tidy
 
 LOWEST = 1e-12
 SIZE = (5.2, 3.2)  # of a panel, inches
@@ -64,8 +66,8 @@ def _panels(trials: pd.DataFrame, column: str, mark: str) -> tuple[Figure, list[
     for ax, (title, _) in zip(axes, tasks, strict=True):
         tidy(ax, title)
     colours = solver_colours(trials["solver"].unique())
-    handles = [Line2D([], [], color=colour, linewidth=1.6, label=solver) for solver, colour in colours.items()]
-    legend(figure, [*handles, Line2D([], [], color=INK, linestyle="--", linewidth=1.2, label=mark)])
+    bound = Line2D([], [], color=INK, linestyle="--", linewidth=1.2, label=mark)
+    legend(figure, [*solver_handles(colours, linewidth=1.6), bound])
     return figure, [(ax, _by_solver(task, column)) for ax, (_, task) in zip(axes, tasks, strict=True)]
 
 
@@ -97,7 +99,8 @@ def _steps(ax: Axes, values: dict[str, np.ndarray], label: str, mark: float) -> 
         x = np.sort(_finite(sample))
         share = np.arange(len(x) + 1) / len(sample)
         x, share = np.concatenate((ends[:1], x, ends[1:])), np.append(share, share[-1])
-        ax.plot(x, share, color=colours[name], drawstyle="steps-post", linewidth=1.6)
+        look: dict[str, Any] = {"color": colours[name], "linestyle": DASHES[colours[name]], "linewidth": 1.6}
+        ax.plot(x, share, drawstyle="steps-post", **look)
     ax.axvline(mark, color=INK, linestyle="--", linewidth=1.2)
     ax.set(xlim=ends, ylim=(-0.02, 1.02), ylabel="share of the layouts up to here")
     ax.yaxis.set_major_formatter(PercentFormatter(1, symbol=" %"))

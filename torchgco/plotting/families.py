@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator, PercentFormatter
 
-from torchgco.plotting.style import INK, legend, panels, solver_colours, solver_dash, tidy
+from torchgco.plotting.style import DASHES, INK, legend, panels, solver_colours, solver_handles, tidy
 
 SIZE = (4.2, 3.2)  # of a panel, inches
 TICKS = (1.0, 1.01, 1.1, 2.0, 10.0)  # ratios that are marked
@@ -36,7 +35,7 @@ def families_figure(table: pd.DataFrame, measure: str) -> Figure:
     _points(axes[3], pairs, names, [INK] * len(pairs))
     axes[3].axvline(0.5, color=INK, linestyle="--", linewidth=1.2)
     axes[3].set(xlim=(-0.02, 1.02), xlabel="share of layouts on which the first is better")
-    legend(figure, [Line2D([], [], color=colour, ls=solver_dash(name), label=name) for name, colour in colours.items()])
+    legend(figure, solver_handles(colours))
     return figure
 
 
@@ -45,7 +44,7 @@ def _profile(ax: Axes, rows: pd.DataFrame, colours: dict[str, str], measure: str
         line = rows[rows["solver"] == name].sort_values("at")
         at = line["at"].to_numpy() - 1.0 + LEAST_EXCESS
         ax.fill_between(at, line["low"], line["high"], color=colour, alpha=0.15, linewidth=0, step="post")
-        ax.plot(at, line["value"], color=colour, linestyle=solver_dash(name), drawstyle="steps-post", linewidth=1.6)
+        ax.plot(at, line["value"], color=colour, linestyle=DASHES[colour], drawstyle="steps-post", linewidth=1.6)
     ax.set_xscale("log")
     ax.set_xticks([tick - 1.0 + LEAST_EXCESS for tick in TICKS])
     ax.xaxis.set_major_formatter(FuncFormatter(lambda place, _: f"{place + 1.0 - LEAST_EXCESS:.4g}"))

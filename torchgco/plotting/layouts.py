@@ -18,11 +18,12 @@ from matplotlib.patches import Circle, Patch
 
 from torchgco.base.errors import InputError
 from torchgco.obstacles.base import Obstacles
+from torchgco.plotting.around import around_words
 from torchgco.plotting.bodies import ABOVE, SIDE, Ball, Plane, Solid
 from torchgco.plotting.gates import draw_gates
 from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, distances, flown, leaving, passes, scene_of, view
-from torchgco.plotting.style import EDGE, INK, SMALL, TITLE, grid, put_head, solver_colours, solver_dash, tasks_of
+from torchgco.plotting.style import DASHES, EDGE, INK, SMALL, TITLE, grid, put_head, solver_colours, tasks_of
 from torchgco.plotting.vehicle_body import VehicleBody
 
 ROCK = "#CFC8BA"
@@ -75,7 +76,8 @@ def layout_grid(
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
     solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact, at the knots and
-    between them, with the map too, of flights that aren't feasible.
+    between them, with the map too, of flights that aren't feasible. The line below counts flights that reach the
+    goal around all obstacles instead of between them, where there are some.
 
     Raises:
         InputError: the trajectories don't fit the layouts, or one has no row in `trials`.
@@ -96,7 +98,8 @@ def layout_grid(
     for i in range(count):
         drawn |= draw_layout(dict(zip(planes, axes[i], strict=True)), scene, i, flights)
         axes[i][0].set_title(f"layout {scene.ids[i]}", fontsize=TITLE, loc="left", color=INK)
-    put_head(figure, _title(trials), _handles(scene, flights, drawn))
+    reached = {name: [(i, flown(x.path)) for i, x in enumerate(row) if not x.end] for name, row in flights.items()}
+    put_head(figure, _title(trials), _handles(scene, flights, drawn), around_words(scene, reached))
     return figure
 
 
@@ -278,7 +281,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], p
         if not flight.still:
             # The first is the thinnest: one of the same course shows at its sides.
             wide = 1.6 if level == len(flights) - 1 else 2.2
-            ax.plot(*path[:, plane].T, linewidth=wide, linestyle=solver_dash(solver), **look)
+            ax.plot(*path[:, plane].T, linewidth=wide, linestyle=DASHES[colours[solver]], **look)
             if scene.body is not None and level == len(flights) - 1:
                 scene.body.draw(ax, flight.states, plane, colours[solver], 2.0)
                 drawn.add("body")
@@ -378,7 +381,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[DrawnFlight]], drawn: set[
     colours = solver_colours(flights)
     for solver, row in flights.items():
         still = all(flight.still for flight in row)
-        look: dict[str, Any] = {"linestyle": "none" if still else solver_dash(solver), "linewidth": 1.6}
+        look: dict[str, Any] = {"linestyle": "none" if still else DASHES[colours[solver]], "linewidth": 1.6}
         handles.append(
             Line2D([], [], color=colours[solver], label=f"{solver}: stays at the start" if still else solver, **look)
         )

@@ -33,7 +33,19 @@ from torchgco.plotting.course import (
     flight,
     handles,
 )
-from torchgco.plotting.style import INK, PALETTE, SMALL, TEXT, legend, panels, solver_colours, tasks_of, tidy
+from torchgco.plotting.style import (
+    DASHES,
+    INK,
+    PALETTE,
+    SMALL,
+    TEXT,
+    legend,
+    panels,
+    solver_colours,
+    solver_handles,
+    tasks_of,
+    tidy,
+)
 
 Frames = Mapping[str, pd.DataFrame]  # by solver
 CLOSE = (0.93, 1.12)  # shares shown near the boundaries
@@ -95,7 +107,7 @@ def distance_figure(frames: Frames, course: Course) -> Figure:
         for solver, frame in frames.items():
             t = flight(frame, "t")["t"]
             near = course.nearness(course.track(frame), t)
-            ax.plot(t, near, color=colours[solver], linewidth=1.4)
+            ax.plot(t, near, color=colours[solver], linestyle=DASHES[colours[solver]], linewidth=1.4)
             ax.plot(t[-1:], near[-1:], color=colours[solver], marker="o", markersize=5, clip_on=title != "")
         ax.axhline(1.0, color=INK, linestyle=":", linewidth=1.2)
         ax.axhline(CONTACT_FACTOR, color=draw.LIMIT, linestyle="--", linewidth=1.0)
@@ -107,7 +119,7 @@ def distance_figure(frames: Frames, course: Course) -> Figure:
         Line2D([], [], color=INK, linestyle=":", linewidth=1.2, label="planner's boundary, 1.0"),
         Line2D([], [], color=draw.LIMIT, linestyle="--", linewidth=1.0, label=f"contact, {CONTACT_FACTOR}"),
     ]
-    legend(figure, [*(Line2D([], [], color=c, label=solver) for solver, c in colours.items()), *marks])
+    legend(figure, [*solver_handles(colours), *marks])
     return figure
 
 

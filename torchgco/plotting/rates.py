@@ -9,11 +9,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter, NullLocator, PercentFormatter
 
-from torchgco.plotting.style import INK, SMALL, legend, panels, solver_colours, tasks_of, tidy
+from torchgco.plotting.style import DASHES, INK, SMALL, legend, panels, solver_colours, solver_handles, tasks_of, tidy
 
 OUTCOMES = ("feasible", "reached", "success")
 SWEEP_PANEL = (3.4, 2.8)  # of a panel, inches
@@ -105,14 +104,14 @@ def sweep_figure(summary: pd.DataFrame, variable: str) -> Figure:
                 middle, high = (group[name].to_numpy(dtype=float) for name in effort[:2])
                 (_line if numeric else _points)(row[-1], x, middle, middle, high, colours[solver], side)
                 row[-1].set_ylabel(effort[2])
+                row[-1].ticklabel_format(axis="y", useOffset=False)  # ratios as they are, not what they exceed 1 by
         for ax, name in zip(row, shown, strict=False):
             _as_rate(ax, name)
         for ax in row:
             ax.set_xlabel(WORDS.get(variable, variable.split(".")[-1].replace("_", " ")))
             tidy(ax, title if ax is row[0] else "")
-    lines = [Line2D([], [], color=colour, marker="o", label=solver) for solver, colour in colours.items()]
     patches = [Patch(color=colour, label=solver) for solver, colour in colours.items()]
-    legend(figure, lines if numeric else patches)
+    legend(figure, solver_handles(colours, marker="o") if numeric else patches)
     return figure
 
 
@@ -164,7 +163,7 @@ def _categories(row: list[Axes], values: pd.Series) -> dict[object, float]:
 def _line(ax: Axes, x, low, middle, high, colour: str, side: tuple[int, int]) -> None:
     ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
     ax.vlines(x, low, high, color=colour, alpha=0.5, linewidth=1)  # a band needs two values
-    ax.plot(x, middle, color=colour, marker="o", markersize=4, linewidth=1.6)
+    ax.plot(x, middle, color=colour, linestyle=DASHES[colour], marker="o", markersize=4, linewidth=1.6)
 
 
 def _bars(ax: Axes, x, low, middle, high, colour: str, side: tuple[int, int]) -> None:

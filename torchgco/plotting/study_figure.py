@@ -23,7 +23,7 @@ from torchgco.plotting.layouts import draw_layout, ends, ends_shown, flights_of,
 from torchgco.plotting.maps import map_handles
 from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
-from torchgco.plotting.style import INK, TEXT, legend_columns, solver_colours, solver_dash, tidy
+from torchgco.plotting.style import DASHES, INK, TEXT, legend_columns, solver_colours, solver_handles, tidy
 from torchgco.plotting.vehicle_body import VehicleBody
 
 Columns = Literal["one", "two"]
@@ -134,10 +134,7 @@ def _frame(
 
 
 def _handles(summary: pd.DataFrame, form: Print, scene: Scene, ends: list[Artist]) -> list[Artist]:
-    lines: list[Artist] = []
-    for name, colour in solver_colours(summary["solver"]).items():
-        dashed: dict[str, Any] = {"color": colour, "linestyle": solver_dash(name), "linewidth": 1.2}
-        lines.append(Line2D([], [], label=name, **dashed))
+    lines = solver_handles(solver_colours(summary["solver"]), linewidth=1.2)
     points = [*ends_shown(scene), Line2D([], [], color=INK, marker="X", linestyle="none", label="contact")]
     for point in points:
         point.set_markersize(9 * form.thin)
@@ -173,7 +170,7 @@ def _costs(ax: Axes, trials: pd.DataFrame) -> None:
         share = np.arange(1, len(known) + 1) / len(rows)
         x = np.concatenate((known[:1].clip(max=1.0) if len(known) else [1.0], known, [COSTLIEST]))
         y = np.concatenate(([0.0], share, share[-1:] if len(share) else [0.0]))
-        look: dict[str, Any] = {"color": colour, "linestyle": solver_dash(name), "linewidth": 1.8}
+        look: dict[str, Any] = {"color": colour, "linestyle": DASHES[colour], "linewidth": 1.8}
         ax.plot(x, y, drawstyle="steps-post", **look)
     ax.set(xlim=(0.995, COSTLIEST), ylim=(-0.03, 1.03), xlabel="cost over the best known", ylabel="reached at up to")
     ax.set_xscale("log")

@@ -9,11 +9,12 @@ They are placed by hand: the automatic layouts of matplotlib leave gaps around a
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
+from textwrap import fill
 from typing import IO, Any, Literal
 from zlib import crc32
 
@@ -24,29 +25,35 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from torchgco.plotting.bodies import Plane
 
 # Okabe and Ito's colours, distinct for colour-blind readers too; their yellow is lost on white paper.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-Dash = str | tuple[float, tuple[float, ...]]
-DASHES: tuple[Dash, ...] = (
-    "-", (0, (5, 1.5)), (0, (6, 1.5, 1.5, 1.5)), (0, (1.5, 1.5)), (0, (3, 3)), (0, (8, 1.5, 1.5, 1.5, 1.5, 1.5)),
-)  # fmt: skip
-# Colour and dash of the presets. Those after the first seven have colours of Paul Tol's.
-KNOWN: dict[str, tuple[str, Dash]] = {
-    "gco": (PALETTE[0], DASHES[0]), "al_ilqr": (PALETTE[1], DASHES[1]), "gco_paper": (PALETTE[3], DASHES[2]),
-    "fatrop": (PALETTE[2], DASHES[3]), "mppi": (PALETTE[4], DASHES[3]), "ilqr": (PALETTE[5], DASHES[4]),
-    "hold": ("#7F7F7F", DASHES[4]), "ipopt": ("#882255", DASHES[5]), "gco_fast": ("#44AA99", DASHES[1]),
-    "interior_point": ("#AA4499", DASHES[1]), "gco_exact": ("#88CCEE", DASHES[2]),
-    "gco_max": ("#332288", DASHES[2]), "multistart": ("#999933", DASHES[5]), "fatrop_guided": ("#117733", DASHES[2]),
-    "path_pursuit": ("#CC6677", DASHES[3]),
+# The presets' colours. Those after the first seven are Paul Tol's.
+KNOWN: dict[str, str] = {
+    "gco": PALETTE[0], "al_ilqr": PALETTE[1], "gco_paper": PALETTE[3], "fatrop": PALETTE[2], "mppi": PALETTE[4],
+    "ilqr": PALETTE[5], "hold": "#7F7F7F", "ipopt": "#882255", "gco_fast": "#44AA99", "interior_point": "#AA4499",
+    "gco_exact": "#88CCEE", "gco_max": "#332288", "multistart": "#999933", "fatrop_guided": "#117733",
+    "path_pursuit": "#CC6677",
+}  # fmt: skip
+# Each colour has its dash, so that colours that colour-blind readers may take for each other have different ones.
+DASHES: dict[str, Any] = {
+    colour: dash
+    for dash, colours in {
+        "-": (PALETTE[0], PALETTE[6], "#88CCEE", "#CC6677"), (0, (5, 1.5)): (PALETTE[1], "#44AA99"),
+        (0, (6, 1.5, 1.5, 1.5)): (PALETTE[3], "#332288", "#117733"),
+        (0, (1.5, 1.5)): (PALETTE[2], PALETTE[4], "#AA4499"), (0, (3, 3)): (PALETTE[5], "#7F7F7F"),
+        (0, (8, 1.5, 1.5, 1.5, 1.5, 1.5)): ("#882255", "#999933"),
+    }.items() for colour in colours
 }  # fmt: skip
 INK, FAINT = "#333333", "#BBBBBB"
 EDGE = "#A39B8B"  # of obstacles
 DPI = 80  # of animations
 SMALL, TEXT, TITLE = 8, 9, 10  # points
+LETTER = 0.07  # inches, of a text
 IN_NOTEBOOKS = 80  # dots per inch
 
 
@@ -66,7 +73,7 @@ def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
     first free colour from there; two share a colour only if there are more solvers than colours.
     """
     names = list(dict.fromkeys(solvers))
-    colours = {name: KNOWN[name][0] for name in names if name in KNOWN}
+    colours = {name: KNOWN[name] for name in names if name in KNOWN}
     for name in sorted(set(names) - set(KNOWN)):
         start = crc32(name.encode()) % len(PALETTE)
         ring = PALETTE[start:] + PALETTE[:start]
@@ -74,9 +81,9 @@ def solver_colours(solvers: Iterable[str]) -> dict[str, str]:
     return {name: colours[name] for name in names}
 
 
-def solver_dash(solver: str) -> Dash:
-    """The dash of a solver's lines, the same in every figure; solvers of one dash have different colours."""
-    return KNOWN[solver][1] if solver in KNOWN else DASHES[crc32(solver.encode()) % len(DASHES)]
+def solver_handles(colours: Mapping[str, str], **look: Any) -> list[Line2D]:
+    """A line of a legend for each solver, by its colour and that colour's dash."""
+    return [Line2D([], [], color=c, linestyle=DASHES[c], label=name, **look) for name, c in colours.items()]
 
 
 def panels(count: int, columns: int, size: tuple[float, float], share: bool = False) -> tuple[Figure, list[Axes]]:
@@ -116,8 +123,7 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
 
 def legend_columns(handles: Sequence[Artist], width: float) -> int:
     """The most columns in which a legend fits into a width, inches; matplotlib fills it column by column."""
-    # Some 0.07 inches per letter, and 0.65 for handle and gap.
-    needed = [0.65 + 0.07 * len(str(handle.get_label())) for handle in handles]
+    needed = [0.65 + LETTER * len(str(handle.get_label())) for handle in handles]
     for columns in range(len(handles), 1, -1):
         rows, longer = divmod(len(handles), columns)
         ends = [(rows + 1) * min(i, longer) + rows * max(i - longer, 0) for i in range(columns + 1)]
@@ -229,15 +235,19 @@ def _axes(figure: Figure, rect: tuple[float, float, float, float], box: np.ndarr
     return ax
 
 
-def put_head(figure: Figure, title: str, handles: list[Artist]) -> None:
-    """Put title and legend above the panels, in inches that the figure grows by."""
+def put_head(figure: Figure, title: str, handles: list[Artist], caption: str = "") -> None:
+    """Put title and legend above the panels, and a caption below, in inches that the figure grows by."""
     columns = legend_columns(handles, figure.get_figwidth())
     before = figure.get_figheight()
-    height = before + 0.4 + 0.19 * ceil(len(handles) / columns)
+    below = fill(caption, int(figure.get_figwidth() / LETTER))
+    foot = 0.19 * len(below.splitlines()) + (0.1 if below else 0.0)
+    height = before + foot + 0.4 + 0.19 * ceil(len(handles) / columns)
     for ax in figure.axes:
         x, y, wide, high = ax.get_position(original=True).bounds
-        ax.set_position((x, y * before / height, wide, high * before / height))
+        ax.set_position((x, (foot + y * before) / height, wide, high * before / height))
     figure.set_figheight(height)
     figure.text(0.5, 1.0 - 0.08 / height, title, fontsize=TITLE + 1, color=INK, ha="center", va="top")
+    if below:
+        figure.text(0.5, 0.05 / height, below, fontsize=TEXT, color=INK, ha="center", va="bottom")
     where: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.0 - 0.25 / height)}
     figure.legend(handles=handles, ncols=columns, fontsize=TEXT, frameon=False, **where)

@@ -194,7 +194,7 @@ def judged_page(trials: pd.DataFrame) -> str:
     single = [[_text(row["solver"]), _number(row["layout"], "{:.0f}"), *_each(row)] for _, row in shown.iterrows()]
     cut = f"The first {SHOWN} of {len(trials)} rows of trials.parquet"
     title = "Every layout" if len(shown) == len(trials) else cut
-    boards = [Board("Solvers", heads, rows), Board(title, every, single)]
+    boards = [Board("Solvers", heads, rows), Board(title, every, single, keys=2)]
     return page(f"{name}: judged", f"{len(trials) // len(summary)} layouts.", boards, NOTES)
 
 
@@ -289,7 +289,7 @@ def leaderboard(
             counted = row.drop(["scenario", "solver", "seed"])
             table.append({"layouts": name, "entry": entry.id, **_card(entry), **counted})
     heads = [("layouts", "the file that is flown"), ("entry", "name of the solver"), *RATED.items(), *SAID.items()]
-    boards = [Board("Results", heads, rows), Board("Entries", CARD_HEADS, [_shown(entry) for entry in entries])]
+    boards = [Board("Results", heads, rows, keys=2), Board("Entries", CARD_HEADS, [_shown(entry) for entry in entries])]
     if refused:
         lines = [[_text(what), _text(error)] for what, error in refused.items()]
         boards.append(Board("Refused", [("entry", "folder or file"), ("why", "what was expected, and found")], lines))

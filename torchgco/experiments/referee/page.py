@@ -30,11 +30,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Board:
-    """A table of a page: `heads` with what each says in words, and rows of as many cells."""
+    """A table of a page: `heads` with what each says in words, and rows of as many cells.
+
+    Args:
+        keys: columns that say what a row is; the last of them stays in sight where the others are scrolled away.
+    """
 
     title: str
     heads: Sequence[tuple[str, str]]
     rows: Sequence[Sequence[Cell]]
+    keys: int = 1
 
 
 def page(title: str, about: str, boards: Sequence[Board], notes: Sequence[str] = ()) -> str:
@@ -63,7 +68,8 @@ def _section(board: Board) -> str:
     rows = "\n".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in board.rows)
     return (
         f'<section><h2>{escape(board.title)}</h2>\n<p class="filter"><label>Rows with the words <input type="search">'
-        f'</label> <span class="count"></span></p>\n<div class="room"><table><thead><tr>{heads}</tr></thead>'
+        f'</label> <span class="count"></span></p>\n<div class="room">'
+        f'<table class="keys-{board.keys}"><thead><tr>{heads}</tr></thead>'
         f"<tbody>\n{rows}\n</tbody></table></div></section>"
     )
 

@@ -73,7 +73,7 @@ export class Flights {
   }
 
   built(flight) {
-    const { name, colour } = this.head.solvers[flight.solver];
+    const { name, seen: colour } = this.head.solvers[flight.solver];
     const group = new THREE.Group();
     const points = this.points(flight.path);
     const drawn = flight.way ? this.points(flight.way) : points; // along the path between the knots

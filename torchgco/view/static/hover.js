@@ -19,11 +19,12 @@ export function pick(flights, camera, x, y, width, height) {
   return best;
 }
 
-/** The lines of the hover: solver and time, what the table says, and what is violated at this knot. */
-export function linesOf({ name, flight, points, k }, flights) {
+/** The lines of the hover: layout, solver and result, time, what the table says, and what is violated at this knot. */
+export function linesOf(label, { name, flight, points, k }, flights) {
   const { head } = flights;
   const place = points[k].toArray().slice(0, head.dimension);
-  const lines = [`${name}, knot ${k}, t = ${flights.timeOf(k + (flight.phase?.first ?? 0), flight).toFixed(2)} s`];
+  const lines = [`${label}, ${name}: ${flight.result}`];
+  lines.push(`knot ${k}, t = ${flights.timeOf(k + (flight.phase?.first ?? 0), flight).toFixed(2)} s`);
   lines.push(`at (${place.map((value) => value.toFixed(2)).join(", ")}) m`);
   lines.push(...flight.rows.map(([label, text]) => `${label}: ${text}`));
   const here = flight.violated.find(([knot]) => knot === k);

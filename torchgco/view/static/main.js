@@ -3,7 +3,7 @@ import * as THREE from "./three.module.min.js";
 import { half, part } from "./data.js";
 import { obstacles } from "./shapes.js";
 import { Orbit } from "./camera.js";
-import { DARK, LIGHT, aim, lights, spaceOf, surroundings } from "./scenery.js";
+import { DARK, LIGHT, against, aim, lights, spaceOf, surroundings } from "./scenery.js";
 import { PARTS } from "./missions.js";
 import { Flights } from "./flights.js";
 import { Search } from "./searches.js";
@@ -65,6 +65,7 @@ class Page {
     window.addEventListener("resize", () => this.resize());
     window.addEventListener("keydown", (event) => this.key(event));
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));
+    this.canvas.addEventListener("click", (event) => this.hover(event)); // a finger doesn't hover
     this.canvas.addEventListener("pointerleave", () => showHover(by("hover"), null));
     this.resize();
     await this.choose(this.firstLayout());
@@ -116,7 +117,6 @@ class Page {
     this.layout = layout;
     // Maps may have a ceiling: it is cut off at first.
     if (!this.placed && this.head.dimension === 3 && layout.obstacles.some((one) => one.cells)) by("cut").value = 0.99;
-    showLayout(layout, number, this.head, this.visible, this.actions());
     this.rebuild();
     if (!this.placed) this.view("perspective");
     if (!this.placed && this.flights.partNames.has("sensed")) this.toggle("through", true); // the map is inside them
@@ -128,6 +128,8 @@ class Page {
     this.clear();
     const { scene, layout, colours } = this;
     scene.background = new THREE.Color(colours.sky);
+    for (const solver of this.head.solvers) solver.seen = against(colours, solver.colour);
+    showLayout(layout, this.number, this.head, this.visible, this.actions());
     this.space = spaceOf(layout, this.head);
     if (this.still) scene.fog = new THREE.Fog(colours.sky, 0.7 * this.space.size, 2.2 * this.space.size);
     this.flights = new Flights(layout, this.head, this.space);
@@ -275,7 +277,8 @@ class Page {
     if (this.orbit.held || !this.flights) return;
     const { clientWidth, clientHeight } = this.canvas;
     const found = pick(this.flights, this.orbit.camera, event.offsetX, event.offsetY, clientWidth, clientHeight);
-    showHover(by("hover"), found && linesOf(found, this.flights), event.offsetX, event.offsetY, clientWidth);
+    const { label } = this.head.layouts[this.number];
+    showHover(by("hover"), found && linesOf(label, found, this.flights), event.offsetX, event.offsetY, clientWidth);
   }
 
   resize() {

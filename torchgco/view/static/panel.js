@@ -72,7 +72,7 @@ export function showLayout(layout, number, head, visible, act) {
   by("picture").dataset.layout = number;
   [...by("chips").children].forEach((chip, i) => chip.setAttribute("aria-pressed", String(i === number)));
   const flown = new Map(layout.flights.map((flight) => [head.solvers[flight.solver].name, flight]));
-  by("solvers").replaceChildren(...head.solvers.map(({ name, colour }) => solver(name, colour, flown.get(name), visible, act)));
+  by("solvers").replaceChildren(...head.solvers.map(({ name, seen }) => solver(name, seen, flown.get(name), visible, act)));
   const said = layout.flights.map((flight) => `${head.solvers[flight.solver].name}: ${flight.result}`);
   by("picture").setAttribute("aria-label", `${head.layouts[number].label}, in perspective. ${said.join("; ")}`);
 }

@@ -10,8 +10,19 @@ const AROUND = 0.06; // that are in view around them at first
 
 const STRAY = 1; // share of the size by which a path that ends badly may widen the scene, on each side
 
-export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, unknown: 0x7fa8d9, ground: 0xe9ebee, line: 0xc9ced6 };
-export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, unknown: 0x5f86b8, ground: 0x20242a, line: 0x3a414b };
+// Solvers have the colours of figures, which are made for paper; in the dark they get the least contrast to what is
+// behind them that WCAG 2.2 asks of graphics (1.4.11).
+export const LIGHT = { sky: 0xf7f8f9, obstacle: 0xcfc3ae, unknown: 0x7fa8d9, ground: 0xe9ebee, line: 0xc9ced6, contrast: 1 };
+export const DARK = { sky: 0x16191d, obstacle: 0x8d8676, unknown: 0x5f86b8, ground: 0x20242a, line: 0x3a414b, contrast: 3 };
+
+/** A colour, mixed with white until it has the contrast to the ground. */
+export function against({ ground, contrast }, colour) {
+  const light = ({ r, g, b }) => 0.2126 * r + 0.7152 * g + 0.0722 * b + 0.05; // they are linear
+  const [seen, white] = [new THREE.Color(colour), new THREE.Color(0xffffff)];
+  const least = contrast > 1 ? contrast * light(new THREE.Color(ground)) : 0;
+  if (light(seen) < least) seen.lerp(white, (least - light(seen)) / (light(white) - light(seen)));
+  return `#${seen.getHexString()}`;
+}
 
 /** The longest side of a box, at least as long as the vehicle is. */
 function longest(box, head) {
