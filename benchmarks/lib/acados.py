@@ -23,7 +23,7 @@ from torchgco.baselines.nlp import Program, transcribe
 from torchgco.constraints.base import Constraint
 from torchgco.costs.quadratic import BoundQuadratic
 from torchgco.dynamics.rollout import open_loop
-from torchgco.obstacles.spheres import BoundSpheres
+from torchgco.obstacles.spheres import BoundSpheres, product_matrices
 from torchgco.problem.problem import Problem
 
 ENVIRONMENT = Path(__file__).resolve().parents[2] / ".venv-acados"  # made by `make`
@@ -154,10 +154,9 @@ def _resting(constraint: Constraint, N: int) -> Constraint:
     if not isinstance(constraint, BoundSpheres) or constraint.velocities is None:
         return constraint
     t = constraint.dt * torch.arange(N + 1, dtype=constraint.centers.dtype).view(-1, 1, 1)
-    return BoundSpheres.prepare(
-        constraint.centers + t * constraint.velocities, constraint.inflated_radii, None, constraint.absent,
-        constraint.vehicle_radius, constraint.knots, constraint.position, constraint.dt,
-    )  # fmt: skip
+    centers = constraint.centers + t * constraint.velocities
+    made = product_matrices(centers, constraint.inflated_radii, None, constraint.absent)
+    return replace(constraint, centers=centers, velocities=None, **made)
 
 
 def _cost(problem: Problem) -> dict[str, np.ndarray]:

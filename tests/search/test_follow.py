@@ -70,7 +70,7 @@ def test_only_a_candidate_far_from_the_goal_takes_more_rounds(monkeypatch) -> No
         monkeypatch.setattr("torchgco.search.following.ROUNDS", rounds)
         ends.append(follow.track(at_rest, known(problem, paths[None].double()), None))
     once, often = ends
-    assert once.arrive().tolist() == [True, False] and often.live.all()
+    assert once.arrive.tolist() == [True, False] and often.live.all()
     assert torch.equal(once.X[0], often.X[0]) and not torch.equal(once.X[1], often.X[1])
     assert int(once.iterations) < int(often.iterations)
 

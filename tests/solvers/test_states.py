@@ -63,13 +63,14 @@ def test_bounds_on_rates_need_no_more_states() -> None:
     torch.testing.assert_close(found.cost, plain.cost, rtol=1e-5, atol=1e-9)
 
 
-def test_states_that_are_no_numbers_stand_for_the_start_held() -> None:
+def test_states_that_are_no_numbers_end_their_own_problem() -> None:
     X0 = turns(0.5)
     held = SWINGS.x0.unsqueeze(1).expand_as(X0).contiguous()
     broken = torch.stack((X0[0], torch.full_like(X0[1], torch.nan)))
     found = solve(SWINGS, solver="interior_point", X0=broken)
     mixed = solve(SWINGS, solver="interior_point", X0=torch.stack((X0[0], held[1])))
-    assert torch.equal(found.U, mixed.U)
+    assert torch.equal(found.U[0], mixed.U[0]) and found.status[0] == mixed.status[0]
+    assert found.statuses[1].name == "NON_FINITE"
 
 
 @pytest.mark.parametrize("name", ["al_ilqr", "ilqr", "multistart", "hold", "mppi", "gco", "fatrop_guided"])

@@ -155,7 +155,9 @@ def _natively(problem: Problem) -> NativeKernels | None:
     try:
         return _in_c(problem)
     except JoinedKnots:
-        raise
+        if not any(constraint.joins_knots for constraint in problem.constraints):
+            raise
+        return None  # as the user gives them, such rows are only measured: solvers have them in another form
     except (InputError, NativeError) as error:
         _check_eager(problem)
         _warn(problem.known.warned, error)

@@ -61,7 +61,7 @@ class Spheres(Constraint):
         centers = torch.where(absent.unsqueeze(-1), 0.0, centers)
         inflated = torch.where(absent, 0.0, radii + vehicle.unsqueeze(-1))
         knots = resolve_knots(self.knots, dims.N, "obstacles.knots", radii.device, dims.obstacles_from)
-        made = _matrices(centers, inflated, velocities, absent)
+        made = product_matrices(centers, inflated, velocities, absent)
         at, dt = dims.position, dims.dt or 0.0
         return BoundSpheres(centers, inflated, velocities, absent, vehicle, knots, at, dt, **made)
 
@@ -165,7 +165,7 @@ class BoundSpheres(OwnKind):
     def remade(self, **changes: Tensor | None) -> BoundSpheres:
         """The same with other numbers, and matrices of the numbers as they are."""
         made = replace(self, **changes)  # type: ignore[arg-type]
-        return replace(made, **_matrices(made.centers, made.inflated_radii, made.velocities, made.absent))
+        return replace(made, **product_matrices(made.centers, made.inflated_radii, made.velocities, made.absent))
 
     def numbers_of(self, where: str, index: int, others: Sequence[Any]) -> list[Number]:
         if bool(self.absent.any()):
@@ -360,7 +360,7 @@ def from_origin(a: Tensor, along: Tensor) -> Tensor:
     return nearest.square().sum(-1).sqrt()
 
 
-def _matrices(o: Tensor, radii: Tensor, v: Tensor | None, absent: Tensor) -> dict[str, Tensor]:
+def product_matrices(o: Tensor, radii: Tensor, v: Tensor | None, absent: Tensor) -> dict[str, Tensor]:
     """The matrices of a BoundSpheres, from its centres, inflated radii, velocities, and which are absent."""
     present = (~absent).to(o.dtype).unsqueeze(-1)  # absent: left out of sums
     rows = [2 * o, -present, (radii.square() - o.square().sum(-1)).unsqueeze(-1)]
