@@ -40,7 +40,7 @@ COSTLY = next(row for row in presets.gco(3).passes.steps if isinstance(row, Path
 PATHS = COSTLY.num_paths  # of each of the two searches where the best candidate is costly
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
-    "another local solution": "moving obstacles, and no paths: waiting, or passing on another side, costs less",
+    "another local solution": "moving obstacles: waiting, or passing on another side, costs less",
     "not reached": "moving obstacles, and no paths: no attempt arrives",
     "not among the paths": f"no candidate along {PATHS} paths of each search ends within 5 % of the best known cost",
     "no path sought": "a candidate does, but the first solve was never caught, so that `gco` sought no path",
