@@ -170,10 +170,8 @@ def _continued(
     sound = (torch.isfinite(best.cost) & torch.isfinite(best.U).flatten(1).all(-1)).view(-1, 1, 1)
     U, X, start = torch.where(sound, best.U, U0), None, problem
     if problem.time is not None and best.times is not None:
-        start, X = (
-            guessing_times(problem, best.times),
-            torch.where(sound, best.X, problem.at_rest[0] if X0 is None else X0),
-        )
+        start = guessing_times(problem, best.times)
+        X = torch.where(sound, best.X, problem.at_rest[0] if X0 is None else X0)
     elif problem.free_start is not None:
         start = problem.guessing(torch.where(sound[:, 0], best.X[:, 0], problem.x0))
     end = solver.solve(start, U, X0=X, **options)

@@ -41,7 +41,7 @@ PATHS = COSTLY.num_paths  # of each of the two searches where the best candidate
 CAUSES = {
     "no solution known": "neither `gco` nor any other search has found a way",
     "another local solution": "moving obstacles: waiting, or passing on another side, costs less",
-    "not reached": "moving obstacles, and no paths: no attempt arrives",
+    "not reached": "moving obstacles: no attempt arrives",
     "not among the paths": f"no candidate along {PATHS} paths of each search ends within 5 % of the best known cost",
     "no path sought": "a candidate does, but the first solve was never caught, so that `gco` sought no path",
     "a later path": "a candidate does, but its path comes after those that `gco` sought",
