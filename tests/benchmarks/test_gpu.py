@@ -55,6 +55,7 @@ def absent(text: str) -> Any:
     raise NativeError("no device")
 
 
+@pytest.mark.slow
 def test_what_the_cpu_solves_proves_nothing(tmp_path) -> None:
     """The CPU takes what a device refuses, and has the bits of C: no problem counts, and none has a speed."""
     bench, path = bench_of(absent), tmp_path / "gpu.md"

@@ -15,6 +15,7 @@ def test_drift_is_the_largest_departure_from_the_length_of_the_rod():
     assert math.isnan(CASES["Robertson"].drift(X.double()))
 
 
+@pytest.mark.slow  # compiles steps of two implicit models
 def test_a_row_says_how_far_the_rod_drifts_and_what_was_compiled(monkeypatch):
     monkeypatch.setattr("benchmarks.families.stiff.compiling", lambda name, method: 2.5)
     cells = dict(zip(HEAD, row("pendulum, index 2", CASES["pendulum, index 2"], "radau5", False), strict=True))

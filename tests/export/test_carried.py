@@ -61,6 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return exported(gentle(), tmp_path_factory.mktemp("rates"))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("push", [0.0, 0.02])
 @pytest.mark.parametrize("stages", [1.0, 0.5, 1.3])
 def test_40_periods_have_the_bits_of_mpc(folder: Path, push: float, stages: float) -> None:
@@ -127,6 +128,7 @@ def test_steps_have_the_bits_of_python(kind: str, tmp_path: Path) -> None:
         x = answer.X[0, min(1, problem.N)].numpy() + 2e-3 * draws.standard_normal(len(x))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("period", [0.05, 0.07, 0.1, 0.15])
 def test_rates_are_those_of_time_in_periods_shorter_than_a_stage(period: float, tmp_path: Path) -> None:
     """As of MPC: else they could change in every period by as much as in a stage."""
@@ -377,6 +379,7 @@ def test_a_step_takes_at_most_the_stack_that_the_page_says(folder: Path) -> None
     assert frames(folder, "-Os", DESKTOP) <= STACK
 
 
+@pytest.mark.slow
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m7(folder: Path, tmp_path: Path) -> None:
     assert on_board(M7, "-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run").startswith(SAME)
@@ -399,6 +402,7 @@ def test_single_precision(problem: Any, tmp_path: Path) -> None:
         x = mpc.answer.X[:, 1].numpy()
 
 
+@pytest.mark.slow
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m4f(tmp_path: Path) -> None:
     folder = torchgco.export_c(loose(), tmp_path / "c", name="car", dtype=torch.float32)

@@ -204,6 +204,7 @@ def test_its_own_test_and_example_pass_without_a_warning(folder: Path, tmp_path:
     assert said(tmp_path / "run", folder=folder).count("status 1") == 20
 
 
+@pytest.mark.slow
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m7(folder: Path, tmp_path: Path) -> None:
     told = on_board(M7, "-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run")

@@ -114,6 +114,7 @@ def test_compiled_problems_choose_the_start_in_c() -> None:
         torch.testing.assert_close(answer.X, fresh.X, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 @needs("arm-none-eabi-gcc", "qemu-system-arm")
 def test_a_cortex_m7(folder: Path, tmp_path: Path) -> None:
     assert on_board(M7, "-Os", "car.c", "car_test.c", folder=folder, program=tmp_path / "run").startswith(SAME)
