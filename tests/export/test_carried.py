@@ -147,6 +147,16 @@ def test_rates_are_those_of_time_in_periods_shorter_than_a_stage(period: float, 
     assert "double constraints_2_upper[" + ("24]" if share < 1 else "2]") in (tmp_path / "car.h").read_text()
 
 
+def test_the_problem_of_a_loop_has_its_rates_already(tmp_path: Path) -> None:
+    """They were shortened a second time."""
+    loops = gentle(), MPC(gentle(), "interior_point", 0.05).compiled
+    first, again = (
+        torchgco.export_c(problem, tmp_path / str(i), "car", period=0.05) for i, problem in enumerate(loops)
+    )
+    for name, value in load_c(first).numbers.items():
+        assert np.array_equal(value, load_c(again).numbers[name]), name
+
+
 @pytest.mark.parametrize("options", [{"period": 0.0}, {"period": "1"}, {"period": 0.1, "receding": False}])
 def test_periods_that_are_none(options: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="period"):

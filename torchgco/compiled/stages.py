@@ -66,9 +66,9 @@ def in_periods(problem: Problem, share: float) -> Problem:
     for i, part in enumerate(rows):
         if follows(part) and part.holds_at(0):
             knots = torch.arange(problem.N, device=problem.x0.device)[part.knots]
-            shares = torch.where(knots == 0, share, 1.0).to(problem.x0).unsqueeze(-1)
+            shares = torch.where(knots == 0, share / part.share, 1.0).to(problem.x0).unsqueeze(-1)
             lower, upper = (bound * shares for bound in part.by_knot)
-            rows[i] = replace(part, lower=lower, upper=upper)
+            rows[i] = replace(part, lower=lower, upper=upper, share=share)
     return replace(problem, constraints=rows)
 
 

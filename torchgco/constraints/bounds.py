@@ -301,6 +301,7 @@ class RateBounds(_Bounds):
     joins_knots: ClassVar[bool] = True
     previous: Any = None
     states: Tensor | None = field(default=None, repr=False)  # (m,) int64: where x has each u_{k-1}, in a solver
+    share: float = field(default=1.0, repr=False)  # of what it allows at knot 0, in a loop of periods below a stage
 
     per_element: ClassVar[tuple[str, ...]] = ("lower", "upper", "previous")
     of: ClassVar[Literal["x", "u"]] = "u"
