@@ -39,7 +39,6 @@ from torchgco.plotting.scene import World, flown, leaving, passes, view, world_o
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
 from torchgco.plotting.ways import Way, ways_along
-from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -79,8 +78,7 @@ class Leg:
     @classmethod
     def of(cls, problem: Problem, solution: Solution, b: int | Sequence[int] | None) -> Leg:
         problem = current_problem(problem)
-        courses, unit = courses_of(problem, solution, b)
-        return cls(paced(problem, solution.times), courses, unit)
+        return cls(problem, *courses_of(problem, solution, b))
 
     def after(self, begins: np.ndarray, labels: Sequence[str]) -> Leg:
         """The same, of problems that begin at times (B,), with other labels (B,)."""
@@ -254,7 +252,7 @@ class SceneMap:
         gates, inside = outlines(problem, courses[0].b), [view(scene, [0], kept, others) for scene in world.scenes]
         for course in courses:
             for scene in world.scenes:
-                inside += moving_corners(scene, 0, course.paths[0])
+                inside += moving_corners(scene, 0, course.way.paths[0], course.way.clock)
             if world.body is not None and course.keeps:
                 inside.append(world.body.extent(course.X[: len(flown(course.paths[0]))]))
         inside += [corners + sign * radius for corners, radius in gates for sign in (-1.0, 1.0)]
@@ -310,7 +308,8 @@ class SceneMap:
     def _obstacles(self, ax: Axes, plane: Plane, lead: np.ndarray) -> set[str]:
         drawn = set[str]()
         for scene in self.world.scenes:
-            leads = {course.colour: passes(scene, 0, course.paths[0]) for course in self.courses}
+            ways = {course.colour: course.way for course in self.courses}
+            leads = {colour: passes(scene, 0, way.paths[0], way.clock) for colour, way in ways.items()}
             drawn |= draw_obstacles(ax, scene, 0, leads, plane)
             if scene.map is not None:
                 drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (ROCK, EDGE))
@@ -333,13 +332,14 @@ class SceneMap:
         if self.world.body is not None:
             self.world.body.draw(ax, course.X[: len(flown(course.paths[0]))], plane, course.colour)
             drawn.add("body")
-        if not course.touches:
-            return drawn
-        way = flown(course.way.paths[0])
-        touched = contacts(self.world.obstacles, way, self.world.first.dt / course.way.pieces, course.way.X[: len(way)])
-        if len(touched):
-            ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))
-            drawn.add("contact")
+        way, path = course.way, flown(course.way.paths[0])
+        marks = {"passed": way.crossings}
+        if course.touches and len(path) > 0:
+            marks["contact"] = contacts(self.world.obstacles, path, float(way.clock[1]), way.X[: len(path)])
+        for kind, places in marks.items():
+            if len(places):
+                ax.plot(*places[:, plane].T, color=course.colour, zorder=4, **marker(kind))
+                drawn.add(kind)
         return drawn
 
 
@@ -352,7 +352,7 @@ def _handles(maps: Sequence[SceneMap], drawn: set[str]) -> list[Artist]:
         "others": Patch(facecolor=ROCK, label="obstacle, plus the vehicle's radius"),
     }
     points: list[Artist] = [
-        Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in ("contact", "away") if kind in drawn
+        Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in drawn
     ]
     of_maps = [handle for map_ in maps for scene in map_.world.scenes for handle in map_handles(scene.map)]
     moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []

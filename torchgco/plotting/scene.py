@@ -136,14 +136,14 @@ def flown(path: np.ndarray) -> np.ndarray:
     return path if finite.all() else path[: int(finite.argmin())]
 
 
-def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
-    """Where a path (N+1, d) passes each obstacle of layout i; without knots, every obstacle where it starts.
+def passes(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray) -> list[Pass]:
+    """Where a path (T, d) with times (T,), s, passes each obstacle of layout i; without one, each where it starts.
 
     An obstacle at rest is passed where the path has its x (where it has it several times, at the closest of these
-    knots), a moving one where it comes closest.
+    places), a moving one where it comes closest.
     """
     path, closest = flown(path), []
-    t = scene.dt * np.arange(len(path))
+    t = clock[: len(path)]
     step = np.abs(np.diff(path[:, 0])).max(initial=0.0)
     for body in scene.bodies[i]:
         if len(path) == 0:
@@ -159,15 +159,16 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
     return closest
 
 
-def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
-    """Places (C, d) where a path (N+1, d) touches obstacles or the map of layout i: the deepest of each contact.
+def contacts(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
+    """Places (C, d) where a path (T, d) touches obstacles or the map of layout i: the deepest of each contact.
 
-    Bodies touch, and distances are measured, as by the judge; between the knots the
-    path is straight, and the states (N+1, n) change evenly, by which a vehicle's body turns.
+    Bodies touch, and distances are measured, as by the judge; between even times (T,), s, the
+    path is straight, and the states (T, n) change evenly, by which a vehicle's body turns.
     """
+    dt = float(clock[1]) if len(clock) > 1 else 0.0
     if scene.obstacles is not None:
         kept = None if states is None else states[: len(flown(path))]
-        return contact.contacts(scene.obstacles[i], flown(path), scene.dt, kept)
+        return contact.contacts(scene.obstacles[i], flown(path), dt, kept)
     places, knots = pieces(flown(path))
     depth = np.full(max(len(places) - 1, 0), -np.inf)
     if len(places) == 0:
@@ -179,7 +180,7 @@ def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None =
     for ball, margin in balls:
         for body in scene.bodies[i]:
             reach = CONTACT_FACTOR * (body.radius + margin)
-            depth = np.maximum(depth, reach - body.along(ball, scene.dt * knots, reach))
+            depth = np.maximum(depth, reach - body.along(ball, dt * knots, reach))
         if (field := scene.map_of(i)) is not None:
             depth = np.maximum(depth, map_depth(field, ball, margin))
     return deepest(places, depth)

@@ -61,6 +61,7 @@ from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
 from torchgco.plotting.vehicle_body import VehicleBody
+from torchgco.plotting.ways import Way
 from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
@@ -72,7 +73,7 @@ Arrays = Mapping[str, np.ndarray]
 
 def write_report(
     folder: Path,
-    trajectories: Callable[[Arrays], Arrays] | None = None,
+    trajectories: Callable[[Arrays], Mapping[str, Sequence[Way]]] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
     tasks: Tasks | None = None,
@@ -83,8 +84,8 @@ def write_report(
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
     Args:
-        trajectories: states for the picture of the layouts, X (L, N+1, n) by solver in the order of `layouts.npz`, from
-            the arrays of `solutions.npz`; None: no such picture.
+        trajectories: by solver in the order of `layouts.npz`, for the picture of the layouts, from the arrays of
+            `solutions.npz`; None: no such picture.
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
         tasks: of the study, whose numbers these pictures show where layouts have none; None: layouts have all that is
@@ -104,13 +105,13 @@ def write_report(
         stored = Layouts.load(folder / LAYOUTS)
         layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), tasks)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
-            states = {name: X[:SHOWN_LAYOUTS] for name, X in trajectories(solutions).items()}
+            ways = {name: every[:SHOWN_LAYOUTS] for name, every in trajectories(solutions).items()}
         if figures:
-            to_draw["layouts"] = lambda: layout_grid(layouts, states, trials, **how)
+            to_draw["layouts"] = lambda: layout_grid(layouts, ways, trials, **how)
         if printed:
             for ending in ("png", "pdf"):
                 to_draw[f"study.{ending}"] = lambda: study_figure(
-                    layouts, states, trials, parts[0].summary, printed, **how
+                    layouts, ways, trials, parts[0].summary, printed, **how
                 )
     if pdf:
         to_draw = {name if name.startswith("study.") else f"{name}.pdf": figure for name, figure in to_draw.items()}
