@@ -89,7 +89,7 @@ def flown(tmp_path: Path) -> Path:
 def test_trajectories_are_made_from_the_controls_and_drawn(flown: Path) -> None:
     seen = {}
 
-    def roll_out(solutions: Any) -> dict[str, list[Way]]:
+    def roll_out(solutions: Any, count: int) -> dict[str, list[Way]]:
         seen.update(controls=solutions["U"].shape)
         return {"gco": ways(np.zeros((2, 4, 6)))}
 

@@ -31,5 +31,5 @@ def study_figure(layouts: Mapping[str, np.ndarray], states: Mapping[str, Any], *
     return printed.study_figure(layouts, _of(layouts, states), *words, **more)
 
 
-def contacts(scene: scenes.Scene, i: int, path: np.ndarray) -> np.ndarray:
-    return scenes.contacts(scene, i, path, scene.dt * np.arange(len(path)))
+def contacts(scene: scenes.Scene, i: int, path: np.ndarray, dt: float = 0.5) -> np.ndarray:
+    return scenes.contacts(scene, i, path, dt * np.arange(len(path)))

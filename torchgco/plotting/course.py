@@ -105,7 +105,7 @@ class Course:
 
     def _scene(self, start: np.ndarray) -> Scene:
         fields = (self.bodies,), start[:, :3], self.goal[None], self.vehicle_radius, self.goal_radius
-        return Scene(*fields, 0.0, np.zeros(1), self.map, body=self.body)
+        return Scene(*fields, np.zeros(1), self.map, body=self.body)
 
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of a box around goal, gates and track, a little wider where obstacles are."""

@@ -171,12 +171,12 @@ def _leading(scene: Scene, i: int, flights: list[DrawnFlight]) -> tuple[np.ndarr
     """The path (K, d) that says where obstacles are cut: the first solver's, or the first that leaves the start; and
     the times (K,) there, s.
 
-    Where none does, it is the straight line to the goal.
+    Where none does, it is the straight line to the goal, at once.
     """
     for flight in flights:
         if len(flown(flight.path)) > 1 and np.ptp(flown(flight.path), axis=0).max() > 0:
             return flight.path, flight.clock
-    return np.linspace(scene.start[i], scene.goal[i], 100), scene.dt * np.arange(100)
+    return np.linspace(scene.start[i], scene.goal[i], 100), np.zeros(100)
 
 
 def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass]], plane: Plane) -> set[str]:

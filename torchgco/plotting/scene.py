@@ -33,7 +33,6 @@ class Scene:
         start, goal: (L, d), nan where unknown.
         margin: the vehicle's radius, 0 where unknown.
         goal_radius: nan where unknown.
-        dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
         map: of all layouts, or one of each, or None.
         body: the vehicle's, in the place of the margin; None: it is a ball.
@@ -49,7 +48,6 @@ class Scene:
     goal: np.ndarray
     margin: float
     goal_radius: float
-    dt: float
     ids: np.ndarray
     map: DistanceField | None = None
     gates: np.ndarray | None = None
@@ -105,7 +103,6 @@ def scene_of(
         goal=point("goal"),
         margin=float(layouts.get("vehicle_radius", 0.0)) if body is None else 0.0,
         goal_radius=float(layouts.get("goal_radius", np.nan)),
-        dt=float(layouts.get("dt", 0.0)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
         map=map_of(layouts),
         gates=gates_in(layouts),
@@ -295,13 +292,12 @@ def world_of(problem: Problem, b: int) -> World:
     goal, radius = np.full_like(start, np.nan), np.nan
     if single.goal is not None:
         goal, radius = single.goal.position.cpu().numpy(), float(single.goal.radius[0])
-    dt = float(getattr(single.dynamics, "dt", None) or 0.0)
     none: dict[float, list[Solid]] = {} if maps else {0.0: []}
     scenes = [
-        Scene((tuple(bodies),), start, goal, vehicle, radius, dt, np.array([b]))
+        Scene((tuple(bodies),), start, goal, vehicle, radius, np.array([b]))
         for vehicle, bodies in (by_radius or none).items()
     ]
-    scenes += [Scene(((),), start, goal, vehicle, radius, dt, np.array([b]), field) for vehicle, field in maps]
+    scenes += [Scene(((),), start, goal, vehicle, radius, np.array([b]), field) for vehicle, field in maps]
     return World(tuple(scenes), tuple(others), tuple(single.obstacles), VehicleBody.of(single))
 
 

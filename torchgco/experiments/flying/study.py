@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,7 @@ from torchgco.experiments.flying.metrics import check_metrics
 from torchgco.experiments.flying.mission_flight import PLANS_KEPT, FleetBatch, MissionBatch, check_fleets
 from torchgco.experiments.flying.progress import Bar
 from torchgco.experiments.flying.workers import Shared, cut, fly_all, trial_bar
-from torchgco.experiments.reports.report import (
-    SHOWN_LAYOUTS,
-    mission_table,
-    write_fleet_report,
-    write_mission_report,
-    write_report,
-)
+from torchgco.experiments.reports.report import mission_table, write_fleet_report, write_mission_report, write_report
 from torchgco.experiments.reports.view import write_view
 from torchgco.experiments.results.durations import states_of, times_at
 from torchgco.experiments.results.folder import COLUMNS, DONE, JUDGED, StudyFolder, with_success
@@ -249,7 +244,7 @@ def _report(study: _Study, folder: Path) -> str:
     plan = study.plan
     if study.layouts.vehicles is not None:
         return write_fleet_report(folder, study.setup.vehicle, study.layouts, plan.figures)
-    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.tasks)
+    return write_report(folder, partial(_trajectories, study), plan.figures, plan.figure, study.tasks)
 
 
 def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
@@ -351,11 +346,11 @@ def _update(study: _Study, store: StudyFolder, swept: Sequence[str]) -> None:
         say("The best costs of the layouts have changed: best_cost and success were computed again.\n")
 
 
-def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, list[Way]]:
-    """The trajectories of every solver through the first layouts, for the pictures."""
+def _trajectories(study: _Study, flown: Mapping[str, np.ndarray], count: int) -> dict[str, list[Way]]:
+    """The trajectories of every solver through the first `count` layouts, for the pictures."""
     names, every, times = flown["solver"].tolist(), flown["U"], flown.get("times")
     ways = {name: dict[int, Way]() for name in names}
-    for places in (shown for group in study.tasks.groups if len(shown := group[group < SHOWN_LAYOUTS])):
+    for places in (shown for group in study.tasks.groups if len(shown := group[group < count])):
         problem = study.tasks.of(places, exact=True).problem
         for i, name in enumerate(names):
             U = torch.from_numpy(every[i][places, : problem.N])

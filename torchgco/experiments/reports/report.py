@@ -73,7 +73,7 @@ Arrays = Mapping[str, np.ndarray]
 
 def write_report(
     folder: Path,
-    trajectories: Callable[[Arrays], Mapping[str, Sequence[Way]]] | None = None,
+    trajectories: Callable[[Arrays, int], Mapping[str, Sequence[Way]]] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
     tasks: Tasks | None = None,
@@ -84,7 +84,7 @@ def write_report(
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
     Args:
-        trajectories: by solver in the order of `layouts.npz`, for the picture of the layouts, from the arrays of
+        trajectories: of so many of the first layouts in `layouts.npz`, by solver, for their picture, from the arrays of
             `solutions.npz`; None: no such picture.
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
@@ -103,9 +103,10 @@ def write_report(
     to_draw = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
         stored = Layouts.load(folder / LAYOUTS)
-        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), tasks)
+        count = min(stored.count, SHOWN_LAYOUTS)
+        layouts, how = _posed(stored.take(range(count)), tasks)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
-            ways = {name: every[:SHOWN_LAYOUTS] for name, every in trajectories(solutions).items()}
+            ways = trajectories(solutions, count)
         if figures:
             to_draw["layouts"] = lambda: layout_grid(layouts, ways, trials, **how)
         if printed:
