@@ -310,7 +310,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], p
 
 
 def ends(scene: Scene, flights: Mapping[str, list[DrawnFlight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
-    """Entries of a legend for the ways in which flights end short of the goal without contact.
+    """Entries of a legend for passed gates, and the ways in which flights end short of the goal without contact.
 
     Args:
         boxes: corners (2, d) of the maps in each row of `columns` layouts, seen from above.
@@ -319,6 +319,7 @@ def ends(scene: Scene, flights: Mapping[str, list[DrawnFlight]], boxes: list[np.
     for row in flights.values():
         for i, flight in enumerate(row):
             box, path = boxes[i // columns][:, ABOVE], flown(flight.path)
+            kinds |= {"passed"} if len(flight.crossings) else set()
             if not flight.still:
                 kinds |= _ended(flight, leaving(box, path[:, ABOVE]) is not None)
     return marked(kinds, scene)

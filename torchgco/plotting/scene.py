@@ -186,13 +186,16 @@ def contacts(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray, states: 
 def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
     """Lower and upper corner (2, d), m, of a map of the layouts `shown`.
 
-    Starts, goals and the paths of `whole`, (N+1, d) each, are inside, and of `others` those that stay near these or on
-    the map of cells or points. Obstacles and paths that go farther widen the picture only by a share of its size, as a
-    long wall or a diverged path would shrink all the rest to a dot.
+    Starts, goals, gates and the paths of `whole`, (N+1, d) each, are inside, and of `others` those that stay near these
+    or on the map of cells or points. Obstacles and paths that go farther widen the picture only by a share of its size,
+    as a long wall or a diverged path would shrink all the rest to a dot.
     """
     shown = list(shown)
     ring = np.nan_to_num(scene.goal_radius)
     ends = [scene.start[shown], scene.goal[shown] - ring, scene.goal[shown] + ring]
+    if scene.gates is not None:
+        balls = scene.gates[shown].reshape(-1, scene.dimension + 1)
+        ends += [balls[:, :-1] - balls[:, -1:], balls[:, :-1] + balls[:, -1:]]
     edges = [_extent(body, scene.margin) for i in shown for body in scene.bodies[i] if not body.moving]
     if scene.map is not None:
         edges += [np.stack([low, high]) for low, high in zip(scene.map.origin, scene.map.upper, strict=True)]

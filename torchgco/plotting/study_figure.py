@@ -192,6 +192,7 @@ def _shrink(figure: Figure, form: Print) -> None:
         ax.xaxis.labelpad = ax.yaxis.labelpad = 1
         for spine in ax.spines.values():
             spine.set_linewidth(0.5)
+        for shape in (*ax.lines, *ax.patches):
+            shape.set_linewidth(form.thin * shape.get_linewidth())
         for line in ax.lines:
-            line.set_linewidth(form.thin * line.get_linewidth())
             line.set_markersize(form.thin * line.get_markersize())
