@@ -274,6 +274,7 @@ class SpheresInFreeTime(Obstacles):
 
     def at_factor(self, factor: Tensor) -> BoundSpheres:
         """The same for stages of factor (B,) times dt."""
+        assert self.spheres.velocities is not None
         return self.spheres.remade(velocities=factor.view(-1, 1, 1) * self.spheres.velocities)
 
     def along(self, X: Tensor) -> BoundSpheres:

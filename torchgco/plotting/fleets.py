@@ -71,8 +71,7 @@ def fleet_animation(
     """Write a GIF of the first fleet, 5 pictures per second, in real time where 100 suffice: discs half as wide as what
     the vehicles keep, with their ways so far, and where all of these lead."""
     drawn = _scene(members, X, U, 0)
-    t, colours = drawn.courses[0].t, [course.colour for course in drawn.courses]
-    paths, radii = [course.paths[0] for course in drawn.courses], 0.5 * distances.max(axis=1)
+    t, radii = drawn.courses[0].t, 0.5 * distances.max(axis=1)
     pale = replace(drawn, courses=[replace(course, colour=PALE) for course in drawn.courses])
     figure = Figure(figsize=(WIDTH, drawn.height(WIDTH) + 0.4), layout="constrained")
     pale.draw(figure)
@@ -80,13 +79,16 @@ def fleet_animation(
 
     def show(k: int) -> str:
         for ax, plane in zip(figure.axes, drawn.planes, strict=True):
-            for way, radius, colour in zip(paths, radii, colours, strict=True):
-                ax.plot(*way[: k + 1, plane].T, color=colour, linewidth=1.2, zorder=7)
-                x, y = way[k, list(plane)].tolist()
-                ax.add_patch(Circle((x, y), radius, facecolor=colour, edgecolor="white", zorder=8))
+            for course, radius in zip(drawn.courses, radii, strict=True):
+                way = course.way.paths[0][: k * course.way.pieces + 1, plane]
+                ax.plot(*way.T, color=course.colour, linewidth=1.2, zorder=7)
+                x, y = way[-1].tolist()
+                ax.add_patch(Circle((x, y), radius, facecolor=course.colour, edgecolor="white", zorder=8))
         return f"{t[k]:.1f} s"
 
-    return write_gif(figure.axes, show, frames_of(len(t), float(t[1])), path, colours)
+    return write_gif(
+        figure.axes, show, frames_of(len(t), float(t[1])), path, [course.colour for course in drawn.courses]
+    )
 
 
 def _scene(members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.ndarray], b: int) -> SceneMap:

@@ -25,7 +25,7 @@ from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, distances, flown, leaving, passes, scene_of, view
 from torchgco.plotting.style import DASHES, EDGE, INK, SMALL, TITLE, grid, put_head, solver_colours, tasks_of
 from torchgco.plotting.vehicle_body import VehicleBody
-from torchgco.plotting.ways import Way
+from torchgco.plotting.ways import Way, Ways
 
 ROCK = "#CFC8BA"
 TALLEST = 1.5  # heights of a panel as a share of its width
@@ -45,17 +45,15 @@ class DrawnFlight:
     """One solver's trajectory through one layout, along the path that is judged."""
 
     path: np.ndarray  # (T, d) m
-    clock: np.ndarray  # (T,) s, of moving obstacles
     end: str  # "" at the goal, else INFEASIBLE or SHORT
     contacts: np.ndarray  # (C, d) m
     still: bool  # it stays at the start
-    states: np.ndarray  # (K, n) along the path
-    crossings: np.ndarray  # (C, d) m, where it passes gates
+    way: Way
 
 
 def layout_grid(
     layouts: Arrays,
-    trajectories: Mapping[str, Sequence[Way]],
+    trajectories: Ways,
     trials: pd.DataFrame,
     columns: int | None = None,
     rows: int = 3,
@@ -121,9 +119,7 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     return drawn
 
 
-def flights_of(
-    scene: Scene, trajectories: Mapping[str, Sequence[Way]], trials: pd.DataFrame
-) -> dict[str, list[DrawnFlight]]:
+def flights_of(scene: Scene, trajectories: Ways, trials: pd.DataFrame) -> dict[str, list[DrawnFlight]]:
     """The trajectories, one for each of the first layouts by solver, with the verdicts on them."""
     table = trials.drop_duplicates(["solver", "layout"]).set_index(["solver", "layout"])
     verdicts = table[["feasible", "reached"]].astype("boolean").fillna(False)
@@ -139,8 +135,7 @@ def flights_of(
             moved = np.linalg.norm(flown(path) - scene.start[i], axis=-1).max(initial=0.0)
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
             touched = path[:0] if row["feasible"] else contacts(scene, i, path, way.clock, way.X)
-            states = way.X[: len(flown(path))]
-            by_solver[solver].append(DrawnFlight(path, way.clock, end, touched, still, states, way.crossings))
+            by_solver[solver].append(DrawnFlight(path, end, touched, still, way))
     return by_solver
 
 
@@ -157,7 +152,7 @@ def views(scene: Scene, flights: Mapping[str, list[DrawnFlight]], count: int, co
         here = [row[i] for row in flights.values() for i in shown]
         whole = [flown(flight.path) for flight in here if not flight.end]
         if scene.body is not None:
-            whole += [scene.body.extent(flight.states) for flight in here if not flight.end]
+            whole += [scene.body.extent(flight.way.X[: len(flown(flight.path))]) for flight in here if not flight.end]
         boxes.append(view(scene, shown, whole, [flown(flight.path) for flight in here if flight.end]))
     low, high = min(box[0, 0] for box in boxes), max(box[1, 0] for box in boxes)
     tallest = max(float(np.ptp(box, axis=0)[1:].max()) for box in boxes)
@@ -175,7 +170,7 @@ def _leading(scene: Scene, i: int, flights: list[DrawnFlight]) -> tuple[np.ndarr
     """
     for flight in flights:
         if len(flown(flight.path)) > 1 and np.ptp(flown(flight.path), axis=0).max() > 0:
-            return flight.path, flight.clock
+            return flight.path, flight.way.clock
     return np.linspace(scene.start[i], scene.goal[i], 100), np.zeros(100)
 
 
@@ -290,13 +285,13 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], p
             wide = 1.6 if level == len(flights) - 1 else 2.2
             ax.plot(*path[:, plane].T, linewidth=wide, linestyle=DASHES[colours[solver]], **look)
             if scene.body is not None and level == len(flights) - 1:
-                scene.body.draw(ax, flight.states, plane, colours[solver], 2.0)
+                scene.body.draw(ax, flight.way.X[: len(path)], plane, colours[solver], 2.0)
                 drawn.add("body")
         away = leaving(np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
         ended = _ended(flight, away is not None)
         # A solver that returned nothing has its mark at the start.
         last = path[-1:] if len(path) else scene.start[i][None]
-        marks = {"contact": flight.contacts, "passed": flight.crossings} | {
+        marks = {"contact": flight.contacts, "passed": flight.way.crossings} | {
             kind: last for kind in ended if kind == "infeasible" or (kind == "short" and not flight.still)
         }
         if away is not None:
@@ -319,7 +314,7 @@ def ends(scene: Scene, flights: Mapping[str, list[DrawnFlight]], boxes: list[np.
     for row in flights.values():
         for i, flight in enumerate(row):
             box, path = boxes[i // columns][:, ABOVE], flown(flight.path)
-            kinds |= {"passed"} if len(flight.crossings) else set()
+            kinds |= {"passed"} if len(flight.way.crossings) else set()
             if not flight.still:
                 kinds |= _ended(flight, leaving(box, path[:, ABOVE]) is not None)
     return marked(kinds, scene)

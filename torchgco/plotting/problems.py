@@ -25,11 +25,11 @@ from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, SIDE, Plane
 from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import (
-    MARKED,
     ROCK,
     draw_obstacles,
     draw_others,
     draw_targets,
+    marked,
     marker,
     moving_corners,
     moving_handles,
@@ -298,11 +298,8 @@ class SceneMap:
         ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]])
         ax.set(xlabel="x [m]" if plane == self.planes[-1] else "", ylabel=f"{'xyz'[plane[1]]} [m]")
         words = {ABOVE: "from above", SIDE: "from the side"}
-        tidy(
-            ax,
-            f"{words[plane]}, obstacles cut where problem {self.courses[0].b} flies" if len(self.planes) > 1 else "",
-            grid=None,
-        )
+        told = f"{words[plane]}, obstacles cut where problem {self.courses[0].b} flies" if len(self.planes) > 1 else ""
+        tidy(ax, told, grid=None)
         return drawn
 
     def _obstacles(self, ax: Axes, plane: Plane, lead: np.ndarray) -> set[str]:
@@ -351,12 +348,10 @@ def _handles(maps: Sequence[SceneMap], drawn: set[str]) -> list[Artist]:
         "body": Patch(facecolor="none", edgecolor=INK, label="the vehicle's body, at some knots"),
         "others": Patch(facecolor=ROCK, label="obstacle, plus the vehicle's radius"),
     }
-    points: list[Artist] = [
-        Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in MARKED if kind in drawn
-    ]
     of_maps = [handle for map_ in maps for scene in map_.world.scenes for handle in map_handles(scene.map)]
     moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
     known = {handle.get_label(): handle for handle in reversed(of_maps)}
+    points = marked(drawn, maps[0].world.first)
     return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *known.values()]
 
 

@@ -133,20 +133,19 @@ def flown(path: np.ndarray) -> np.ndarray:
     return path if finite.all() else path[: int(finite.argmin())]
 
 
-def passes(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray) -> list[Pass]:
+def passes(scene: Scene, i: int, path: np.ndarray, t: np.ndarray) -> list[Pass]:
     """Where a path (T, d) with times (T,), s, passes each obstacle of layout i; without one, each where it starts.
 
     An obstacle at rest is passed where the path has its x (where it has it several times, at the closest of these
     places), a moving one where it comes closest.
     """
     path, closest = flown(path), []
-    t = clock[: len(path)]
     step = np.abs(np.diff(path[:, 0])).max(initial=0.0)
     for body in scene.bodies[i]:
         if len(path) == 0:
             closest.append(Pass(body.at(0.0), 0.0, 0.0))
             continue
-        apart = body.distance(path, t)
+        apart = body.distance(path, t[: len(path)])
         k = int(apart.argmin())
         least = float(apart[k] - body.radius - scene.margin)
         if not body.moving:
@@ -156,13 +155,13 @@ def passes(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray) -> list[Pa
     return closest
 
 
-def contacts(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
+def contacts(scene: Scene, i: int, path: np.ndarray, t: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
     """Places (C, d) where a path (T, d) touches obstacles or the map of layout i: the deepest of each contact.
 
     Bodies touch, and distances are measured, as by the judge; between even times (T,), s, the
     path is straight, and the states (T, n) change evenly, by which a vehicle's body turns.
     """
-    dt = float(clock[1]) if len(clock) > 1 else 0.0
+    dt = float(t[1]) if len(t) > 1 else 0.0
     if scene.obstacles is not None:
         kept = None if states is None else states[: len(flown(path))]
         return contact.contacts(scene.obstacles[i], flown(path), dt, kept)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 from typing import Any, Literal
@@ -25,7 +25,7 @@ from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
 from torchgco.plotting.style import DASHES, INK, TEXT, legend_columns, solver_colours, solver_handles, tidy
 from torchgco.plotting.vehicle_body import VehicleBody
-from torchgco.plotting.ways import Way
+from torchgco.plotting.ways import Ways
 
 Columns = Literal["one", "two"]
 COSTLIEST = 2.0  # times the best known cost, where the axis of costs ends
@@ -58,7 +58,7 @@ STUDY_MARGIN = 0.55  # inches at the left of a chart, whose labels are wider tha
 
 def study_figure(
     layouts: Arrays,
-    trajectories: Mapping[str, Sequence[Way]],
+    trajectories: Ways,
     trials: pd.DataFrame,
     summary: pd.DataFrame,
     columns: Columns = "two",

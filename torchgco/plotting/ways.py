@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +30,9 @@ class Way:
         moments = np.interp(self.t[:T], np.arange(len(t)), t)
         paths = tuple(path[:T] for path in self.paths)
         return replace(self, t=moments, clock=self.clock[:T], X=self.X[:T], paths=paths)
+
+
+Ways = Mapping[str, Sequence[Way]]  # by solver, one for each layout
 
 
 def ways_along(

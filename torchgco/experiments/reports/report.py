@@ -61,7 +61,7 @@ from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
 from torchgco.plotting.vehicle_body import VehicleBody
-from torchgco.plotting.ways import Way
+from torchgco.plotting.ways import Ways
 from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
@@ -73,7 +73,7 @@ Arrays = Mapping[str, np.ndarray]
 
 def write_report(
     folder: Path,
-    trajectories: Callable[[Arrays, int], Mapping[str, Sequence[Way]]] | None = None,
+    trajectories: Callable[[Arrays, int], Ways] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
     tasks: Tasks | None = None,
@@ -110,10 +110,8 @@ def write_report(
         if figures:
             to_draw["layouts"] = lambda: layout_grid(layouts, ways, trials, **how)
         if printed:
-            for ending in ("png", "pdf"):
-                to_draw[f"study.{ending}"] = lambda: study_figure(
-                    layouts, ways, trials, parts[0].summary, printed, **how
-                )
+            for kind in ("png", "pdf"):
+                to_draw[f"study.{kind}"] = lambda: study_figure(layouts, ways, trials, parts[0].summary, printed, **how)
     if pdf:
         to_draw = {name if name.startswith("study.") else f"{name}.pdf": figure for name, figure in to_draw.items()}
     draw({name: partial(_draw, folder, name, figure) for name, figure in to_draw.items()})
