@@ -253,7 +253,7 @@ def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str
     bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
     index = next((i for i, constraint in enumerate(problem.constraints) if constraint in problem.obstacles), -1)
     gates = None if len(path) < 2 else gates_of(problem)
-    passed = [] if gates is None else [through_balls(gates.centers, gates.sizes, torch.from_numpy(path).unsqueeze(0))]
+    passed = [] if gates is None else [through_balls(gates.centers, gates.sizes, torch.tensor(path[None]))]
     return ShownFlight(
         solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
         np.where(bad > 0, index, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
