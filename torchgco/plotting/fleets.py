@@ -44,7 +44,9 @@ def fleet_figure(
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, LOWER))[:, 0]
     drawn.draw(upper)
     _ends(upper.axes, members, drawn)
-    _distances(lower.subplots(), courses[0].t, [course.paths[0] for course in courses], distances)
+    _distances(
+        lower.subplots(), courses[0].t, [course.way.paths[0][:: course.way.pieces] for course in courses], distances
+    )
     return figure
 
 
@@ -100,8 +102,8 @@ def _scene(members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.n
         columns, like = list(range(place.start, place.stop)), member.x0
         X_b, U_b = (torch.as_tensor(array[b : b + 1]).to(like) for array in (x, u))
         (way,) = ways_along(member.take(torch.tensor([b], device=like.device)), X_b, U_b, None, [columns])
-        courses.append(Course(b, x[b], u[b], t, (x[b][:, place],), colour, label, True, True, way.until(t)))
-    planes = (ABOVE, SIDE) if courses[0].paths[0].shape[1] == 3 else (ABOVE,)
+        courses.append(Course(b, x[b], u[b], t, colour, label, True, True, way.until(t)))
+    planes = (ABOVE, SIDE) if courses[0].way.paths[0].shape[1] == 3 else (ABOVE,)
     return SceneMap.of(members[0], courses, planes)
 
 
@@ -111,7 +113,7 @@ def _ends(axes: Sequence[Axes], members: Sequence[Problem], drawn: SceneMap) -> 
         ax.set_title("")
         for member, course in zip(members, drawn.courses, strict=True):
             look: dict[str, Any] = {"linestyle": "none", "markeredgecolor": course.colour, "zorder": 6}
-            ax.plot(*course.paths[0][:1, plane].T, marker="s", markersize=5, markerfacecolor="white", **look)
+            ax.plot(*course.way.paths[0][:1, plane].T, marker="s", markersize=5, markerfacecolor="white", **look)
             if member.goal is not None:
                 ends = member.goal.position[course.b].cpu().numpy()[list(plane)]
                 ax.plot(*ends, marker="*", markersize=8, markerfacecolor=course.colour, **look)
