@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +27,7 @@ from benchmarks.lib.command import parser_of
 from benchmarks.lib.page import crossed, filed, markdown, measured, put, share, shown
 from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.style import save
+from torchgco.plotting.ways import ways_along
 from torchgco.scenarios import MapFile, Task
 from torchgco.solvers.contracts import Solver
 
@@ -132,7 +133,7 @@ def flown(name: str, task: Task) -> dict[str, Any]:
     return {
         "solver": name, "status": solution.statuses[0].name, "seconds": seconds, "stages": task.problem.N,
         "cost": float(verdict.cost), "reached": bool(verdict.reached),
-        "distance": float(verdict.goal_distance), "X": solution.X[0].numpy(),
+        "distance": float(verdict.goal_distance), "way": ways_along(task.problem, solution.X, solution.U, None, [])[0],
     }  # fmt: skip
 
 
@@ -205,17 +206,9 @@ def draw(file: Path, seed: int, solvers: Sequence[str], count: int = 8) -> None:
         for number in range(count)
         for name in solvers
     ]
-    paths: Mapping[str, np.ndarray] = {
-        name: padded([held["X"] for held in flights if held["solver"] == name]) for name in solvers
-    }
-    trials = pd.DataFrame(flights).drop(columns="X").assign(scenario="floors", model="unicycle", feasible=True)
-    save(layout_grid(layouts.arrays(), paths, trials, rows=2), file)
-
-
-def padded(paths: Sequence[np.ndarray]) -> np.ndarray:
-    """States (L, N+1, n) of the longest horizon, the last state repeated."""
-    longest = max(map(len, paths))
-    return np.stack([np.concatenate((X, np.repeat(X[-1:], longest - len(X), axis=0))) for X in paths])
+    ways = {name: [held["way"] for held in flights if held["solver"] == name] for name in solvers}
+    trials = pd.DataFrame(flights).drop(columns="way").assign(scenario="floors", model="unicycle", feasible=True)
+    save(layout_grid(layouts.arrays(), ways, trials, rows=2), file)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import torchgco
 from torchgco import (
     Boxes,
     ControlBounds,
+    FreeTime,
     FunctionDynamics,
     Gates,
     Goal,
@@ -27,12 +28,17 @@ from torchgco import (
 )
 from torchgco.constraints.gates import GateBalls, GateSquares
 from torchgco.dynamics.rollout import open_loop
+from torchgco.experiments.results.durations import states_of
 from torchgco.judging.gates import passes
 from torchgco.kernels import measured
+from torchgco.plotting.ways import ways_along
 from torchgco.roadmap.roadmap import timed
 from torchgco.search import Follow
 from torchgco.search.nearby import Nearby
 from torchgco.solvers.contracts import Call
+from torchgco.view.document import flights_of
+from torchgco.view.packing import Packing
+from torchgco.view.vehicles import Look
 
 D = torch.float64
 B, N = 2, 40
@@ -134,11 +140,14 @@ def test_the_judge_counts_what_is_passed_between_the_knots_too() -> None:
     way = passes(near.constraints[0], open_loop(near.dynamics, x0, U))
     assert way is not None and way.passed.tolist() == [[True, False]]  # at the knot itself the first is 0.18 m away
     torch.testing.assert_close(way.distance, torch.tensor([[0.1, 0.3]], dtype=D))
+    torch.testing.assert_close(way.place[0, 0], torch.tensor([1.05, 0.0, 0.0], dtype=D))
+    assert bool(way.place[0, 1].isnan().all())
     assert judge(near, U).gates_passed.tolist() == [1] and not bool(judge(near, U).feasible)
     frames = Gates([[1.05, 0.1, 0], [3.1, 0, 0], [4.0, 0, 0]], normals=[[1.0, 0, 0], [-1, 0, 0], [1, 0, 0]],
         half_widths=0.2, knots=[3, 10, 20])  # fmt: skip
     crossed = passes(points(frames, x0=x0).constraints[0], open_loop(near.dynamics, x0, U))
     assert crossed is not None and crossed.passed.tolist() == [[True, False, False]]  # backwards; not then
+    torch.testing.assert_close(crossed.place[0, 0], torch.tensor([1.05, 0.0, 0.0], dtype=D))
     assert float(crossed.distance[0, 0]) == pytest.approx(0.1) and bool(torch.isinf(crossed.distance[0, 1:]).all())
 
 
@@ -251,6 +260,42 @@ def test_pictures_show_them() -> None:
         figure = torchgco.plot(problem, torchgco.solve(problem), b=0)
         words = {text.get_text() for ax in figure.axes for text in ax.texts}
         assert {"1", "2"} <= words
+
+
+@pytest.mark.parametrize("square", [False, True])
+@pytest.mark.parametrize("free", [False, True])
+def test_pictures_mark_where_the_judge_has_them_passed(square: bool, free: bool) -> None:
+    """On the path between the knots, which bends by 0.1 m in a stage; a gate that is missed has no mark."""
+    centers = [[1.1, 0.6, 1.0], [3.0, 4.5, 1.0], [3.5, 0.0, 1.0]]
+    frames = {"normals": [[1.0, 0.5, 0.0]] * 3, "half_widths": 0.3} if square else {"radius": 0.3}
+    start = torch.tensor([[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]], dtype=D)
+    time = FreeTime(0.5, 2.0) if free else None
+    problem = points(Gates(centers, knots=[2, 4, 7], **frames), x0=start, N=8, time=time)
+    model = replace(problem.dynamics, dt=0.5)
+    problem = replace(problem, dynamics=model)
+    U = torch.tensor([0.0, 1.0, 0.0], dtype=D).expand(1, 8, 3).contiguous()
+    times = torch.linspace(0.0, 4.0, 9, dtype=D).unsqueeze(0) if free else None
+    (way,) = ways_along(problem, states_of(problem, U, times), U, times, [range(3)])
+    t = np.linspace(0.0, 4.0, 400_001)
+    path = np.stack((t, 0.5 * t**2, np.ones_like(t)), axis=-1)  # by hand
+    due = []
+    for center in centers[:2]:
+        away = path - center
+        nearest = np.abs(away @ [1.0, 0.5, 0.0]) if square else np.linalg.norm(away, axis=-1)
+        due.append(path[nearest.argmin()])
+    np.testing.assert_allclose(way.crossings, due, atol=2e-3)
+    knots = way.X[:: way.pieces, :3]
+    assert np.linalg.norm(knots - due[0], axis=-1).min() > 0.1 and way.pieces > 1
+
+    solution = torchgco.solve(problem, U, solver="interior_point", verbose=False)
+    solution = replace(solution, U=U, X=states_of(problem, U, times), times=times)
+    above = torchgco.plot(problem, solution).axes[0]
+    (marks,) = [line.get_xydata() for line in above.lines if line.get_marker() == "o" and len(line.get_xdata()) == 2]
+    np.testing.assert_allclose(marks, way.crossings[:, :2])
+    (flight,) = flights_of(
+        problem, Look("ball"), solution.X, U, "one", ["failed"], [[]], 1e-3, np.array([False]), times
+    )
+    np.testing.assert_allclose(flight.packed(Packing(), 0)["crossings"], way.crossings, atol=1e-3)
 
 
 def test_squares_in_the_plane() -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from tests.plotting.straight import ways
 from tests.trials import flights, manifest, missions, trials
 from torchgco.base.errors import InputError
 from torchgco.experiments.reports.finished import _told
@@ -13,6 +14,7 @@ from torchgco.experiments.results.kinds import TRAJECTORIES, format_report, join
 from torchgco.experiments.results.merge import merge
 from torchgco.experiments.statistics.paired import compare
 from torchgco.experiments.statistics.statistics import plain, summarise
+from torchgco.plotting.ways import Way
 from torchgco.scenarios.layouts import Layouts
 
 HITS = [i < 30 for i in range(32)]
@@ -87,9 +89,9 @@ def flown(tmp_path: Path) -> Path:
 def test_trajectories_are_made_from_the_controls_and_drawn(flown: Path) -> None:
     seen = {}
 
-    def roll_out(solutions: Any) -> dict[str, np.ndarray]:
+    def roll_out(solutions: Any, count: int) -> dict[str, list[Way]]:
         seen.update(controls=solutions["U"].shape)
-        return {"gco": np.zeros((2, 4, 6))}
+        return {"gco": ways(np.zeros((2, 4, 6)))}
 
     text = write_report(flown, roll_out, printed="one")
     assert seen == {"controls": (1, 2, 3, 2)}

@@ -58,10 +58,10 @@ def test_obstacles_and_vehicles_are_where_they_are_then() -> None:
         np.testing.assert_allclose(vehicle.center, then(solution, t, 0.1), atol=1.1e-3)
 
 
-def then(solution: torchgco.Solution, t: float, dt: float) -> np.ndarray:
-    """Where the point of a problem with one is at t, s, after its last knot."""
+def then(solution: torchgco.Solution, t: float, dt: float, b: int = 0) -> np.ndarray:
+    """Where the point of problem b is at t, s, after its last knot."""
     k = min(int(t / dt + 1e-9), solution.U.shape[1] - 1)
-    x, u, h = solution.X[0, k], solution.U[0, k], t - dt * k
+    x, u, h = solution.X[b, k], solution.U[b, k], t - dt * k
     return (x[:2] + h * x[2:] + 0.5 * h**2 * u).numpy()
 
 
@@ -85,6 +85,30 @@ def test_pictures_follow_the_path_between_the_knots(free: bool) -> None:
     (way,) = [np.column_stack(line.get_data()) for line in scene.lines if len(line.get_xdata()) > 20]
     path = np.stack([then(solution, t, dt) for t in np.linspace(0.0, float(times[-1]), 2001)])
     assert np.linalg.norm(path[:, None] - way, axis=-1).min(0).max() < 2e-3
+
+
+def test_flights_of_other_durations_are_among_the_same_obstacles() -> None:
+    """Whose obstacles went from knot to knot in the times of each, which can't be in one picture."""
+    model = FunctionDynamics(POINT.function, 4, 2, 0.5, "rk4", position=slice(0, 2))
+    goal, time = torchgco.Goal(state=[4.0, 0.0, 0.0, 0.0], required=True), torchgco.FreeTime(0.2, 3.0, 1.0)
+    starts = torch.tensor([[0.0, 0.0, 0.0, 0.0], [1.6, 0.5, 0.0, 0.0]]).double()
+    stated = Problem(model, COST, [MOVING, ControlBounds(-9.0, 9.0)], starts, 6, goal, time=time)
+    solution = torchgco.solve(stated, verbose=False)
+    film, ends = torchgco.animate(stated, solution, [0, 1]), solution.t[:, -1]
+    assert float((ends[0] - ends[1]).abs()) > 0.1
+    for t in np.linspace(0.0, float(ends.max()), 5):
+        drawn = film.at(t)
+        (ball,) = [shape.get_path().vertices for shape in drawn if isinstance(shape, Polygon)]
+        np.testing.assert_allclose(0.5 * (ball.max(0) + ball.min(0)), [1.0, t - 1.0], atol=1e-3)
+        for b, shape in enumerate(shape for shape in drawn if isinstance(shape, Circle)):
+            due = then(solution, min(t, float(ends[b])), float(solution.t[b, 1]), b)
+            np.testing.assert_allclose(shape.center, due, atol=1.1e-3)
+    scene, *_ = torchgco.plot(stated, solution).axes
+    passed = [text for text in scene.texts if text.get_text().endswith(" s")]
+    assert passed  # at the time itself
+    for text in passed:
+        y, seconds = text.get_position()[1], float(text.get_text().removesuffix(" s"))
+        assert abs(y - (seconds - 1.0)) < 0.06
 
 
 @pytest.mark.slow

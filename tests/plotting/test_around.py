@@ -9,10 +9,10 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
 
+from tests.plotting.straight import layout_grid
 from tests.plotting.test_layouts import plane, space
 from tests.trials import flights, trials
 from torchgco.plotting.around import passes_around
-from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.scene import scene_of
 
 

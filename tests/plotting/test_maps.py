@@ -13,6 +13,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import torchgco
+from tests.plotting.straight import contacts, layout_grid, study_figure
 from tests.trials import flights, trials
 from tests.view.scenes import solution
 from tests.view.test_packing import part
@@ -21,10 +22,8 @@ from torchgco.experiments.statistics.statistics import summarise
 from torchgco.plotting import missions
 from torchgco.plotting.animation import mission_animation
 from torchgco.plotting.course import Course
-from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.maps import UNSEEN
-from torchgco.plotting.scene import contacts, scene_of
-from torchgco.plotting.study_figure import study_figure
+from torchgco.plotting.scene import scene_of
 
 N, DT, RADIUS = 60, 0.1, 0.2
 WALLS = [2.15, 3.65, 5.15, 6.65, 8.15]  # m: the middles of five walls, 0.3 m thick

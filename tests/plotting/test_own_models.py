@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 import torchgco
+from tests.plotting import straight
 from tests.trials import flights, trials
 from torchgco import Boxes, Ellipsoids, Moved
 from torchgco.dynamics import Dynamics, Unicycle
@@ -81,7 +82,7 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
     X = [problem.x0]
     for k in range(problem.N):
         X.append(problem.dynamics.step(X[-1], U[:, k]))
-    states = {"gco": torch.stack(X, 1).numpy()}
+    states = {"gco": straight.ways(torch.stack(X, 1).numpy(), problem.dynamics.dt)}
 
     layouts.save(tmp_path / "layouts.npz")
     rows = flights("gco", verdict.reached.tolist())
@@ -97,7 +98,7 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
 
         monkeypatch.setattr(report, name, keep)
     monkeypatch.setattr(report, "_draw", lambda folder, name, figure: name[:5] in ("layou", "study") and figure())
-    report.write_report(tmp_path, lambda flown: states, printed="one", tasks=Tasks(setup, layouts))
+    report.write_report(tmp_path, lambda flown, count: states, printed="one", tasks=Tasks(setup, layouts))
 
     assert len(shown) == 3  # one of them as a png and as a pdf
     at = vehicle.dynamics.position
@@ -105,9 +106,8 @@ def test_a_study_draws_what_was_judged(seed: int, tmp_path: Path, monkeypatch: p
         np.testing.assert_array_equal(scene.start, problem.x0[:, at])
         np.testing.assert_array_equal(scene.goal, task.goal)
         assert scene.margin == float(spheres.vehicle_radius[0]) and scene.goal_radius == task.goal_radius
-        assert scene.dt == problem.dynamics.dt
         (paths,) = flights_of(scene, states, table).values()
-        assert all((flight.path == states["gco"][i, :, at]).all() for i, flight in enumerate(paths))
+        assert all((flight.path == states["gco"][i].X[:, at]).all() for i, flight in enumerate(paths))
         touching = [len(flight.contacts) > 0 for flight in paths]
         assert touching == (verdict.clearance < 0).tolist()
         words = {text.get_text() for box in figure.legends for text in box.get_texts()}
@@ -121,8 +121,8 @@ def test_what_is_unknown_is_not_claimed() -> None:
     layouts = Layouts(np.array([[[0.0, 0.4]]]), np.array([[0.3]]))
     states = {"gco": np.linspace([[-5.0, 0]], [[5.0, 0]], 9).transpose(1, 0, 2)}
     rows = trials({"solver": "gco", "feasible": False, "reached": False})
-    figure = layout_grid(layouts.arrays(), states, rows)
+    figure = straight.layout_grid(layouts.arrays(), states, rows)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["gco", "infeasible", "obstacle"]
     more = {"vehicle_radius": np.array(0.05), "start": np.array([-5.0, 0]), "goal": np.array([5.0, 0])}
-    known = layout_grid(layouts.arrays() | more, states, rows)
+    known = straight.layout_grid(layouts.arrays() | more, states, rows)
     assert "infeasible without contact" in [text.get_text() for text in known.legends[0].get_texts()]

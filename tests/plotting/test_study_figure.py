@@ -11,11 +11,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from tests.plotting.straight import study_figure
 from tests.plotting.test_layouts import plane, straight
 from tests.trials import flights, trials
 from torchgco.base.errors import InputError
 from torchgco.experiments.statistics.statistics import summarise
-from torchgco.plotting.study_figure import PRINTS, Columns, study_figure
+from torchgco.plotting.study_figure import PRINTS, Columns
 from torchgco.plotting.style import save
 
 COSTS = {"gco": [100.0, 100.0, 130.0, 100.0], "al_ilqr": [150.0, 110.0, 100.0, 90.0]}

@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 import torch
 
+from tests.plotting.straight import layout_grid
 from tests.reference import boxes as slow
 from torchgco import InputError, Planar
 from torchgco.obstacles.boxes import BoundBoxes
 from torchgco.plotting.bodies import Box, bodies
-from torchgco.plotting.layouts import layout_grid
 from torchgco.scenarios.layouts import BOXES, Layouts, concatenate
 from torchgco.scenarios.vehicle import Vehicle
 

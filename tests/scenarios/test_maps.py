@@ -15,11 +15,12 @@ from matplotlib.colors import to_hex
 from PIL import Image
 
 from tests.maps.files import samples
+from tests.plotting.straight import layout_grid
 from torchgco import Hold, InputError, judge
 from torchgco.experiments.config.build import compose
 from torchgco.experiments.results.identity import layout_digests
 from torchgco.maps import DistanceField, OccupancyGrid, PointCloud
-from torchgco.plotting.layouts import ROCK, layout_grid
+from torchgco.plotting.layouts import ROCK
 from torchgco.scenarios import Layouts, MapFile, concatenate
 
 # Two rooms of 4 m x 4 m with a door, and a closed one of 1 m x 4 m; cells of 0.25 m.

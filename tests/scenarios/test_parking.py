@@ -8,10 +8,10 @@ import pytest
 import torch
 from matplotlib.collections import PolyCollection
 
+from tests.plotting.straight import layout_grid
 from tests.trials import flights, trials
 from torchgco import Bicycle, InputError, compose
 from torchgco.obstacles.body import BoundBody
-from torchgco.plotting.layouts import layout_grid
 from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.problem.goal import GoalState
 from torchgco.scenarios import Layouts, Parking, concatenate
@@ -97,6 +97,6 @@ def test_pictures_show_the_rectangle() -> None:
     assert all(np.linalg.norm(seen - corner, axis=1).min() < 1e-12 for corner in corners)
     touched = [line for line in ax.lines if line.get_marker() == "X"]
     assert len(touched) == 1 and touched[0].get_xydata()[-1, 1] < 0.5
-    assert "the body of gco, at some knots" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "the body of gco, at some times" in [text.get_text() for text in figure.legends[0].get_texts()]
     ball = layout_grid(layouts.arrays(), {"gco": X}, rows)
     assert not any(len(held.get_paths()) == 5 for held in ball.axes[0].collections)

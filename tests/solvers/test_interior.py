@@ -557,3 +557,20 @@ def test_where_no_time_is_left_the_guess_is_returned_and_not_called_feasible() -
     late = InteriorPoint().solve(problem, zeros(problem), max_seconds=1e-9)
     assert late.statuses == [Status.TIME_LIMIT] * 3 and torch.equal(late.U, zeros(problem))
     torch.testing.assert_close(late.violation, problem.constraints[0].worst(late.X, late.U), rtol=1e-12, atol=0)
+
+
+def test_where_no_shift_makes_a_step_residuals_are_closed_first() -> None:
+    """Long steps of a Van der Pol oscillator far out, from where its rollouts have no end: none of these was solved.
+
+    Where slopes are huge, rounding leaves the Riccati recursion no curvature of the cost; steps that close residuals
+    alone lead back to where it has one (IPOPT restores feasibility there, too).
+    """
+    field = lambda x, u: torch.stack(((1.0 - x[..., 1] ** 2) * x[..., 0] - x[..., 1] + u[..., 0], x[..., 0]), dim=-1)
+    model = FunctionDynamics(field, 2, 1, 0.4, "rk4")
+    starts = [[-4.776742458, -3.311410546], [1.965049505, 4.142746925], [-4.948676228, -3.243484497], [1.97, 4.14]]
+    problem = Problem(model, QuadraticCost([1.0] * 2, [1.0], [1.0] * 2), [], torch.tensor(starts, dtype=D), 25)
+    assert not bool(
+        torch.isfinite(open_loop(model, problem.x0, torch.zeros(4, 25, 1, dtype=D))).flatten(1).all(1).any()
+    )
+    solution = InteriorPoint().solve(problem, torch.zeros(4, 25, 1, dtype=D))
+    assert sum(status is Status.CONVERGED for status in solution.statuses) >= 3  # which ones, rounding may decide

@@ -169,10 +169,6 @@ class Constraint(PerElement):
         """The same where state n is the factor of time, followed by controls, and `later` factors are to be chosen."""
         return self if self.in_place and not is_users(self) else FirstRowsInTime(self, n, m)
 
-    def paced(self, factor: Tensor) -> Constraint:
-        """The same for obstacles that move `factor` (B,) times as far from knot to knot."""
-        return self
-
     def at_factor(self, factor: Tensor) -> Constraint:
         """The same of a form `in_free_time` whose factor (B,) is held."""
         return self

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +25,7 @@ class Passes(NamedTuple):
     # m: the least on the way through it, from a ball's centre, or in a square's plane along the farther side; of one
     # that isn't passed, the least after the gates before it; infinite: not crossed, or after one that isn't passed.
     distance: Tensor
+    place: Tensor  # (B, G, d), m: where that is on the way through it; NaN of one that isn't passed
 
 
 class Meetings(NamedTuple):
@@ -32,6 +34,7 @@ class Meetings(NamedTuple):
     time: Tensor  # in knots: until which the gate may be passed on this way
     next: Tensor  # the time from which on the gate after it may be passed, if that before this one was passed earlier
     distance: Tensor  # m; see `Passes`
+    at: Tensor  # in knots: when it is as far as this
     passes: Tensor  # bool
 
 
@@ -68,6 +71,12 @@ def passes(constraint: Constraint, X: Tensor) -> Passes | None:
     return _through_squares(gates, X[..., gates.components]) if isinstance(gates, GateSquares) else None
 
 
+def crossings(ways: Iterable[Passes], b: int = 0) -> np.ndarray:
+    """Places (C, d), m, where trajectory b passes gates, constraint by constraint."""
+    places = [way.place[b][way.passed[b]].detach().cpu().double().numpy() for way in ways]
+    return np.concatenate(places) if places else np.empty((0, 0))
+
+
 def through_balls(centers: Tensor, radii: Tensor, p: Tensor) -> Passes:
     """How positions p (B, N+1, d) pass balls (B, G, d) of radii (B, G): where lines come within these, and 1e-3 m."""
     k, move = torch.arange(p.shape[1] - 1, dtype=p.dtype, device=p.device), p.diff(dim=1)
@@ -82,7 +91,7 @@ def through_balls(centers: Tensor, radii: Tensor, p: Tensor) -> Passes:
         half = (middle.square() - (a.square().sum(-1) - reach.square()) / square).clamp(min=0.0).sqrt()
         enters, leaves = ((middle + shift).clamp(0.0, 1.0) for shift in (-half, half))
         meets = away <= reach
-        return Meetings(k + torch.where(meets, leaves, 1.0), k + enters, away, meets)
+        return Meetings(k + torch.where(meets, leaves, 1.0), k + enters, away, k + middle.clamp(0.0, 1.0), meets)
 
     return _in_order(p, map(meetings, range(centers.shape[1])))
 
@@ -107,7 +116,7 @@ def _through_squares(gates: GateSquares, p: Tensor) -> Passes:
         away = torch.where(crosses, away, torch.inf)
         time = under + share  # a square that comes twice, one after the other, is crossed twice
         later = torch.nextafter(time, torch.full_like(time, torch.inf))
-        return Meetings(time, later, away, away <= gates.half_widths[:, g : g + 1] + ADMITTED)
+        return Meetings(time, later, away, time, away <= gates.half_widths[:, g : g + 1] + ADMITTED)
 
     return _in_order(p, map(meetings, range(gates.centers.shape[1])))
 
@@ -117,12 +126,17 @@ def _in_order(p: Tensor, gates: Iterable[Meetings]) -> Passes:
     (B, K, _), passed = p.shape, []
     k = torch.arange(K - 1, device=p.device)
     since, left = p.new_zeros(B, 1), torch.zeros(B, 1, dtype=torch.bool, device=p.device)
-    for time, next_, away, passes in gates:
+    for time, next_, away, at, passes in gates:
         later = (time >= since) & ~left
         first = torch.where(later & passes, k, K - 1).amin(-1, keepdim=True)  # K - 1: none
         left = first == K - 1
         until = torch.where(~passes & (k > first), k, K - 1).amin(-1, keepdim=True)
         way = later & (left | ((k >= first) & (k < until)))
-        passed.append((~left, first + 1, torch.where(way, away, torch.inf).amin(-1, keepdim=True)))
+        least, nearest = torch.where(way, away, torch.inf).min(-1, keepdim=True)
+        moment = at.gather(1, nearest)
+        knot = moment.long().clamp(0, K - 2)
+        a, b = (p.gather(1, (knot + i).unsqueeze(-1).expand(-1, -1, p.shape[-1])) for i in (0, 1))
+        place = torch.where(left.unsqueeze(-1), torch.nan, a + (moment - knot).unsqueeze(-1) * (b - a))
+        passed.append((~left, first + 1, least, place))
         since = torch.where(left, since, torch.maximum(since, next_.gather(1, first.clamp(max=K - 2))))
     return Passes(*(torch.cat(column, dim=1) for column in zip(*passed, strict=True)))

@@ -146,10 +146,6 @@ class BoundSpheres(OwnKind):
     def later(self, t: float) -> BoundSpheres:
         return self if self.velocities is None else self.remade(centers=self.centers + t * self.velocities)
 
-    def paced(self, factor: Tensor) -> BoundSpheres:
-        """The same spheres, which move `factor` (B,) times as far from knot to knot."""
-        return self if self.velocities is None else self.remade(velocities=factor.view(-1, 1, 1) * self.velocities)
-
     def in_free_time(self, n: int, m: int, later: int) -> Obstacles:
         return SpheresInFreeTime(self, n) if self.moving else self
 
@@ -278,7 +274,8 @@ class SpheresInFreeTime(Obstacles):
 
     def at_factor(self, factor: Tensor) -> BoundSpheres:
         """The same for stages of factor (B,) times dt."""
-        return self.spheres.paced(factor)
+        assert self.spheres.velocities is not None
+        return self.spheres.remade(velocities=factor.view(-1, 1, 1) * self.spheres.velocities)
 
     def along(self, X: Tensor) -> BoundSpheres:
         """The same for the factor of the first states of X (B, N+1, n), which all others have where X obeys the

@@ -99,10 +99,11 @@ def film_of(legs: Sequence[Leg], b: int | Sequence[int], radii: Sequence[float] 
         for i, artists in enumerate(standing):
             for artist in artists:
                 artist.set_visible(i == present)
-        leading, world = legs[present].courses[0], scenes[present].world
-        nominal = world.first.dt * float(np.interp(t, leading.t, np.arange(len(leading.t))))
+        longest = max((course.way for course in legs[present].courses), key=lambda way: float(way.t[-1]))
+        world = scenes[present].world
+        seconds = float(np.interp(t, longest.t, longest.clock))
         for ax, plane in zip(axes, scenes[0].planes, strict=True):
-            shown.extend(_moving(ax, world, plane, nominal))
+            shown.extend(_moving(ax, world, plane, seconds))
             for place in range(len(legs[0].courses)):
                 at = _present(legs, place, t)
                 for i in range(at + 1):
@@ -150,7 +151,7 @@ def _at_rest(scene: SceneMap) -> SceneMap:
 
 
 def _moving(ax: Axes, world: World, plane: Plane, t: float) -> list[Artist]:
-    """What moves, where it is at t, s, of stages that last dt."""
+    """What moves, where it is at t, s."""
     look: dict[str, Any] = {"facecolor": (*to_rgb(ROCK), 0.6), "zorder": 1.0}
     bodies = [body for scene in world.scenes for body in scene.bodies[0] if body.moving]
     drawn: list[Artist] = [ax.add_patch(Polygon(body.outline(0.0, plane, t), **look)) for body in bodies]

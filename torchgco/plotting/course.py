@@ -101,11 +101,11 @@ class Course:
 
     def contacts(self, track: np.ndarray, period: float) -> np.ndarray:
         """Places (C, 3) where a track of control steps of `period` seconds touches an obstacle or the map."""
-        return contacts(self._scene(track[:1], period), 0, track[:, :3], track)
+        return contacts(self._scene(track[:1]), 0, track[:, :3], period * np.arange(len(track)), track)
 
-    def _scene(self, start: np.ndarray, period: float = 0.0) -> Scene:
+    def _scene(self, start: np.ndarray) -> Scene:
         fields = (self.bodies,), start[:, :3], self.goal[None], self.vehicle_radius, self.goal_radius
-        return Scene(*fields, period, np.zeros(1), self.map, body=self.body)
+        return Scene(*fields, np.zeros(1), self.map, body=self.body)
 
     def limits(self, track: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of a box around goal, gates and track, a little wider where obstacles are."""

@@ -44,7 +44,9 @@ def fleet_figure(
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(high, LOWER))[:, 0]
     drawn.draw(upper)
     _ends(upper.axes, members, drawn)
-    _distances(lower.subplots(), courses[0].t, [course.paths[0] for course in courses], distances)
+    _distances(
+        lower.subplots(), courses[0].t, [course.way.paths[0][:: course.way.pieces] for course in courses], distances
+    )
     return figure
 
 
@@ -71,8 +73,7 @@ def fleet_animation(
     """Write a GIF of the first fleet, 5 pictures per second, in real time where 100 suffice: discs half as wide as what
     the vehicles keep, with their ways so far, and where all of these lead."""
     drawn = _scene(members, X, U, 0)
-    t, colours = drawn.courses[0].t, [course.colour for course in drawn.courses]
-    paths, radii = [course.paths[0] for course in drawn.courses], 0.5 * distances.max(axis=1)
+    t, radii = drawn.courses[0].t, 0.5 * distances.max(axis=1)
     pale = replace(drawn, courses=[replace(course, colour=PALE) for course in drawn.courses])
     figure = Figure(figsize=(WIDTH, drawn.height(WIDTH) + 0.4), layout="constrained")
     pale.draw(figure)
@@ -80,13 +81,16 @@ def fleet_animation(
 
     def show(k: int) -> str:
         for ax, plane in zip(figure.axes, drawn.planes, strict=True):
-            for way, radius, colour in zip(paths, radii, colours, strict=True):
-                ax.plot(*way[: k + 1, plane].T, color=colour, linewidth=1.2, zorder=7)
-                x, y = way[k, list(plane)].tolist()
-                ax.add_patch(Circle((x, y), radius, facecolor=colour, edgecolor="white", zorder=8))
+            for course, radius in zip(drawn.courses, radii, strict=True):
+                way = course.way.paths[0][: k * course.way.pieces + 1, plane]
+                ax.plot(*way.T, color=course.colour, linewidth=1.2, zorder=7)
+                x, y = way[-1].tolist()
+                ax.add_patch(Circle((x, y), radius, facecolor=course.colour, edgecolor="white", zorder=8))
         return f"{t[k]:.1f} s"
 
-    return write_gif(figure.axes, show, frames_of(len(t), float(t[1])), path, colours)
+    return write_gif(
+        figure.axes, show, frames_of(len(t), float(t[1])), path, [course.colour for course in drawn.courses]
+    )
 
 
 def _scene(members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.ndarray], b: int) -> SceneMap:
@@ -98,8 +102,8 @@ def _scene(members: Sequence[Problem], X: Sequence[np.ndarray], U: Sequence[np.n
         columns, like = list(range(place.start, place.stop)), member.x0
         X_b, U_b = (torch.as_tensor(array[b : b + 1]).to(like) for array in (x, u))
         (way,) = ways_along(member.take(torch.tensor([b], device=like.device)), X_b, U_b, None, [columns])
-        courses.append(Course(b, x[b], u[b], t, (x[b][:, place],), colour, label, True, True, way.until(t)))
-    planes = (ABOVE, SIDE) if courses[0].paths[0].shape[1] == 3 else (ABOVE,)
+        courses.append(Course(b, x[b], u[b], t, colour, label, True, True, way.until(t)))
+    planes = (ABOVE, SIDE) if courses[0].way.paths[0].shape[1] == 3 else (ABOVE,)
     return SceneMap.of(members[0], courses, planes)
 
 
@@ -109,7 +113,7 @@ def _ends(axes: Sequence[Axes], members: Sequence[Problem], drawn: SceneMap) -> 
         ax.set_title("")
         for member, course in zip(members, drawn.courses, strict=True):
             look: dict[str, Any] = {"linestyle": "none", "markeredgecolor": course.colour, "zorder": 6}
-            ax.plot(*course.paths[0][:1, plane].T, marker="s", markersize=5, markerfacecolor="white", **look)
+            ax.plot(*course.way.paths[0][:1, plane].T, marker="s", markersize=5, markerfacecolor="white", **look)
             if member.goal is not None:
                 ends = member.goal.position[course.b].cpu().numpy()[list(plane)]
                 ax.plot(*ends, marker="*", markersize=8, markerfacecolor=course.colour, **look)

@@ -25,6 +25,7 @@ from torchgco.plotting.maps import draw_map, map_handles
 from torchgco.plotting.scene import Arrays, Pass, Scene, contacts, distances, flown, leaving, passes, scene_of, view
 from torchgco.plotting.style import DASHES, EDGE, INK, SMALL, TITLE, grid, put_head, solver_colours, tasks_of
 from torchgco.plotting.vehicle_body import VehicleBody
+from torchgco.plotting.ways import Way, Ways
 
 ROCK = "#CFC8BA"
 TALLEST = 1.5  # heights of a panel as a share of its width
@@ -34,24 +35,25 @@ TRAIL = 1.0  # s of a moving obstacle's way that are drawn
 NEAR_SHARE, FAR_SHARE, STILL = 0.05, 0.15, 0.01
 INFEASIBLE, SHORT = "infeasible", "feasible, short of the goal"
 MARKED = {
-    "contact": "contact", "short": SHORT, "infeasible": "infeasible without contact", "away": "leaves the picture",
+    "contact": "contact", "passed": "passes a gate", "short": SHORT, "infeasible": "infeasible without contact",
+    "away": "leaves the picture",
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """One solver's trajectory through one layout."""
+    """One solver's trajectory through one layout, along the path that is judged."""
 
-    path: np.ndarray  # (N+1, d) m
+    path: np.ndarray  # (T, d) m
     end: str  # "" at the goal, else INFEASIBLE or SHORT
     contacts: np.ndarray  # (C, d) m
     still: bool  # it stays at the start
-    states: np.ndarray  # (K, n) along the path
+    way: Way
 
 
 def layout_grid(
     layouts: Arrays,
-    trajectories: Arrays,
+    trajectories: Ways,
     trials: pd.DataFrame,
     columns: int | None = None,
     rows: int = 3,
@@ -64,33 +66,32 @@ def layout_grid(
     Args:
         layouts: arrays of a layout file: centers (L, M, d) and radii (L, M) in metres, and, where present, velocities
             (L, M, d), boxes, start and goal ((n,) or (L, n)), vehicle_radius, goal_radius, dt, layout (L,) ids.
-        trajectories: states X (L, N+1, n) by solver, nan where there is none; the first solver is the one under study,
+        trajectories: one for each layout by solver, nan where there is none; the first solver is the one under study,
             drawn over the others.
         trials: with columns scenario, model, layout, solver, feasible, reached.
         columns: default: 4 in the plane, 3 in space.
-        body: of the vehicle, in the place of vehicle_radius: the first solver's is drawn at some knots; None: a ball.
+        body: of the vehicle, in the place of vehicle_radius: the first solver's is drawn at some times; None: a ball.
         position: its place in states; None: they begin with it.
         obstacles: those of the problems that were solved, a batch of one for each layout; None: the layouts' own.
 
     Obstacles are filled as they are and outlined at the vehicle's radius from their sides, as the vehicle is drawn as a
     point. In space each is cut at the height (in the side view: at the y) that the first solver has at its x; those
     that this cut misses are dotted where they are near. A moving obstacle is drawn where it comes closest to the first
-    solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact, at the knots and
-    between them, with the map too, of flights that aren't feasible. The line below counts flights that reach the
-    goal around all obstacles instead of between them, where there are some.
+    solver's trajectory, if it comes near, outlined in that solver's colour. Crosses mark contact, with the map too, of
+    flights that aren't feasible, small discs where gates are passed. The line below counts flights that reach the goal
+    around all obstacles instead of between them, where there are some.
 
     Raises:
         InputError: the trajectories don't fit the layouts, or one has no row in `trials`.
     """
     count = len(layouts["radii"])
-    paths = {solver: np.asarray(states, dtype=float) for solver, states in trajectories.items()}
-    for solver, states in paths.items():
-        if states.ndim != 3 or len(states) != count:
-            raise InputError(f"trajectories.{solver}", f"shape ({count}, N+1, n)", states.shape)
+    for solver, ways in trajectories.items():
+        if len(ways) != count:
+            raise InputError(f"trajectories.{solver}", f"{count} trajectories, one for each layout", len(ways))
     scene = scene_of(layouts, body, position, obstacles)
     columns = columns or (4 if scene.dimension == 2 else 3)
     count = min(count, columns * rows)
-    flights = flights_of(scene, {solver: states[:count] for solver, states in paths.items()}, trials)
+    flights = flights_of(scene, {solver: ways[:count] for solver, ways in trajectories.items()}, trials)
     boxes = views(scene, flights, count, min(columns, count))
     planes = (ABOVE,) if scene.dimension == 2 else (ABOVE, SIDE)
     figure, axes = grid(boxes, count, min(columns, count), planes)
@@ -106,8 +107,8 @@ def layout_grid(
 def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mapping[str, list[DrawnFlight]]) -> set[str]:
     """Draw layout i from one side or several; returns the kinds of drawn shapes and marks, for the legend."""
     here, drawn = {solver: row[i] for solver, row in flights.items()}, set()
-    path = _leading(scene, i, [flight.path for flight in here.values()])
-    leads = {solver_colours(flights)[next(iter(flights), "")] if flights else EDGE: passes(scene, i, path)}
+    path, clock = _leading(scene, i, list(here.values()))
+    leads = {solver_colours(flights)[next(iter(flights), "")] if flights else EDGE: passes(scene, i, path, clock)}
     for plane, ax in axes.items():
         drawn |= draw_obstacles(ax, scene, i, leads, plane)
         drawn |= draw_others(ax, scene.others(i), flown(path), plane)
@@ -118,23 +119,23 @@ def draw_layout(axes: Mapping[Plane, Axes], scene: Scene, i: int, flights: Mappi
     return drawn
 
 
-def flights_of(scene: Scene, paths: Mapping[str, np.ndarray], trials: pd.DataFrame) -> dict[str, list[DrawnFlight]]:
+def flights_of(scene: Scene, trajectories: Ways, trials: pd.DataFrame) -> dict[str, list[DrawnFlight]]:
+    """The trajectories, one for each of the first layouts by solver, with the verdicts on them."""
     table = trials.drop_duplicates(["solver", "layout"]).set_index(["solver", "layout"])
     verdicts = table[["feasible", "reached"]].astype("boolean").fillna(False)
     by_solver: dict[str, list[DrawnFlight]] = {}
-    for solver, states in paths.items():
+    for solver, ways in trajectories.items():
         by_solver[solver] = []
-        for i, X in enumerate(states):
+        for i, way in enumerate(ways):
             if (solver, scene.ids[i]) not in verdicts.index:
                 raise InputError("trials", f"a row of {solver} for layout {scene.ids[i]}", "none")
             row = verdicts.loc[(solver, scene.ids[i])]
             end = "" if row["reached"] else SHORT if row["feasible"] else INFEASIBLE
-            path = X[:, scene.position or slice(scene.dimension)]
+            path = way.X[:, scene.position or slice(scene.dimension)]
             moved = np.linalg.norm(flown(path) - scene.start[i], axis=-1).max(initial=0.0)
             still = len(flown(path)) > 1 and bool(moved < STILL * _way(scene, i))
-            # By the judge, who follows the path between the knots: a straight line may touch what it doesn't.
-            touched = path[:0] if row["feasible"] else contacts(scene, i, path, X)
-            by_solver[solver].append(DrawnFlight(path, end, touched, still, X[: len(flown(path))]))
+            touched = path[:0] if row["feasible"] else contacts(scene, i, path, way.clock, way.X)
+            by_solver[solver].append(DrawnFlight(path, end, touched, still, way))
     return by_solver
 
 
@@ -151,7 +152,7 @@ def views(scene: Scene, flights: Mapping[str, list[DrawnFlight]], count: int, co
         here = [row[i] for row in flights.values() for i in shown]
         whole = [flown(flight.path) for flight in here if not flight.end]
         if scene.body is not None:
-            whole += [scene.body.extent(flight.states) for flight in here if not flight.end]
+            whole += [scene.body.extent(flight.way.X[: len(flown(flight.path))]) for flight in here if not flight.end]
         boxes.append(view(scene, shown, whole, [flown(flight.path) for flight in here if flight.end]))
     low, high = min(box[0, 0] for box in boxes), max(box[1, 0] for box in boxes)
     tallest = max(float(np.ptp(box, axis=0)[1:].max()) for box in boxes)
@@ -161,15 +162,16 @@ def views(scene: Scene, flights: Mapping[str, list[DrawnFlight]], count: int, co
     return boxes
 
 
-def _leading(scene: Scene, i: int, paths: list[np.ndarray]) -> np.ndarray:
-    """The path (K, d) that says where obstacles are cut: the first solver's, or the first that leaves the start.
+def _leading(scene: Scene, i: int, flights: list[DrawnFlight]) -> tuple[np.ndarray, np.ndarray]:
+    """The path (K, d) that says where obstacles are cut: the first solver's, or the first that leaves the start; and
+    the times (K,) there, s.
 
-    Where none does, it is the straight line to the goal.
+    Where none does, it is the straight line to the goal, at once.
     """
-    for path in paths:
-        if len(flown(path)) > 1 and np.ptp(flown(path), axis=0).max() > 0:
-            return path
-    return np.linspace(scene.start[i], scene.goal[i], 100)
+    for flight in flights:
+        if len(flown(flight.path)) > 1 and np.ptp(flown(flight.path), axis=0).max() > 0:
+            return flight.path, flight.way.clock
+    return np.linspace(scene.start[i], scene.goal[i], 100), np.zeros(100)
 
 
 def draw_obstacles(ax: Axes, scene: Scene, i: int, leads: Mapping[str, list[Pass]], plane: Plane) -> set[str]:
@@ -231,10 +233,10 @@ def draw_others(ax: Axes, others: Sequence[Obstacles], lead: np.ndarray, plane: 
     return drawn
 
 
-def moving_corners(scene: Scene, i: int, path: np.ndarray) -> list[np.ndarray]:
+def moving_corners(scene: Scene, i: int, path: np.ndarray, clock: np.ndarray) -> list[np.ndarray]:
     """Lower and upper corners (2, d), m, of the moving obstacles where `draw_obstacles` draws them for a path."""
     boxes = []
-    for body, pass_ in zip(scene.bodies[i], passes(scene, i, path), strict=True):
+    for body, pass_ in zip(scene.bodies[i], passes(scene, i, path, clock), strict=True):
         if body.moving and not _is_far(scene, i, pass_):
             corners = body.corners + body.at(pass_.t) - body.at(0.0)
             boxes.append(np.stack([corners.min(0) - body.radius, corners.max(0) + body.radius]))
@@ -283,13 +285,13 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], p
             wide = 1.6 if level == len(flights) - 1 else 2.2
             ax.plot(*path[:, plane].T, linewidth=wide, linestyle=DASHES[colours[solver]], **look)
             if scene.body is not None and level == len(flights) - 1:
-                scene.body.draw(ax, flight.states, plane, colours[solver], 2.0)
+                scene.body.draw(ax, flight.way.X[: len(path)], plane, colours[solver], 2.0)
                 drawn.add("body")
         away = leaving(np.transpose([ax.get_xlim(), ax.get_ylim()]), path[:, plane])
         ended = _ended(flight, away is not None)
         # A solver that returned nothing has its mark at the start.
         last = path[-1:] if len(path) else scene.start[i][None]
-        marks = {"contact": flight.contacts} | {
+        marks = {"contact": flight.contacts, "passed": flight.way.crossings} | {
             kind: last for kind in ended if kind == "infeasible" or (kind == "short" and not flight.still)
         }
         if away is not None:
@@ -303,7 +305,7 @@ def _paths(ax: Axes, scene: Scene, i: int, flights: Mapping[str, DrawnFlight], p
 
 
 def ends(scene: Scene, flights: Mapping[str, list[DrawnFlight]], boxes: list[np.ndarray], columns: int) -> list[Artist]:
-    """Entries of a legend for the ways in which flights end short of the goal without contact.
+    """Entries of a legend for passed gates, and the ways in which flights end short of the goal without contact.
 
     Args:
         boxes: corners (2, d) of the maps in each row of `columns` layouts, seen from above.
@@ -312,6 +314,7 @@ def ends(scene: Scene, flights: Mapping[str, list[DrawnFlight]], boxes: list[np.
     for row in flights.values():
         for i, flight in enumerate(row):
             box, path = boxes[i // columns][:, ABOVE], flown(flight.path)
+            kinds |= {"passed"} if len(flight.way.crossings) else set()
             if not flight.still:
                 kinds |= _ended(flight, leaving(box, path[:, ABOVE]) is not None)
     return marked(kinds, scene)
@@ -348,6 +351,7 @@ def marker(kind: str, angle: float = 0.0) -> dict[str, Any]:
     """The look of a mark, the same on the map and in the legend; an arrow's angle, rad."""
     shapes: dict[str, dict[str, Any]] = {
         "contact": {"marker": "X", "markeredgecolor": "white", "markeredgewidth": 0.6, "markersize": 7},
+        "passed": {"marker": "o", "markeredgecolor": "white", "markeredgewidth": 0.6, "markersize": 5},
         "short": {"marker": "o", "markerfacecolor": "white", "markersize": 5.5},
         "infeasible": {"marker": "D", "markeredgecolor": "white", "markersize": 6},
         "away": {"marker": (3, 0, np.rad2deg(angle) - 90.0), "markeredgecolor": "white", "markersize": 9},
@@ -394,7 +398,7 @@ def _handles(scene: Scene, flights: Mapping[str, list[DrawnFlight]], drawn: set[
         "grown": Patch(label="plus the vehicle's radius", **outline),
         "others": Patch(facecolor=ROCK, label="obstacle, plus the vehicle's radius"),
         "near": Patch(linestyle=":", label=f"near {first}, missed by this cut", **outline),
-        "body": Patch(facecolor="none", edgecolor=INK, label=f"the body of {first}, at some knots"),
+        "body": Patch(facecolor="none", edgecolor=INK, label=f"the body of {first}, at some times"),
     }
     handles += [handle for kind, handle in shapes.items() if kind in drawn]
     handles += moving_handles(first, colours.get(first, EDGE)) if "moving" in drawn else []

@@ -25,11 +25,11 @@ from torchgco.obstacles.base import ADMITTED
 from torchgco.plotting.bodies import ABOVE, SIDE, Plane
 from torchgco.plotting.gates import Outline, draw_gates, outlines
 from torchgco.plotting.layouts import (
-    MARKED,
     ROCK,
     draw_obstacles,
     draw_others,
     draw_targets,
+    marked,
     marker,
     moving_corners,
     moving_handles,
@@ -39,7 +39,6 @@ from torchgco.plotting.scene import World, flown, leaving, passes, view, world_o
 from torchgco.plotting.style import EDGE, INK, PALETTE, SMALL, TEXT, NotebookFigure, legend_columns, tidy
 from torchgco.plotting.trajectory import LIMIT
 from torchgco.plotting.ways import Way, ways_along
-from torchgco.problem.in_time import paced
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.problem.times import times
 from torchgco.solution import Solution
@@ -60,7 +59,6 @@ class Course:
     X: np.ndarray  # (N+1, n)
     U: np.ndarray  # (N, m)
     t: np.ndarray  # (N+1,)
-    paths: tuple[np.ndarray, ...]  # (N+1, d) each: of the position, and of further ones that keep apart
     colour: str
     label: str
     keeps: bool  # whether its constraints hold
@@ -79,8 +77,7 @@ class Leg:
     @classmethod
     def of(cls, problem: Problem, solution: Solution, b: int | Sequence[int] | None) -> Leg:
         problem = current_problem(problem)
-        courses, unit = courses_of(problem, solution, b)
-        return cls(paced(problem, solution.times), courses, unit)
+        return cls(problem, *courses_of(problem, solution, b))
 
     def after(self, begins: np.ndarray, labels: Sequence[str]) -> Leg:
         """The same, of problems that begin at times (B,), with other labels (B,)."""
@@ -199,10 +196,9 @@ def courses_of(problem: Problem, solution: Solution, b: int | Sequence[int] | No
         label = f"problem {b}: {solution.statuses[b].name}, cost {float(solution.cost[b]):.6g}"
         moments = (t if t.dim() == 1 else t[b]).cpu().double().numpy()
         X, U, moments = X[: last + 1], U[:last], moments[: last + 1]
-        paths = tuple(X[:, columns] for columns in _positions(problem))
         keeps = bool(solution.violation[b] <= ADMITTED)
         way = ways[i].until(moments)
-        shown.append(Course(b, X, U, moments, paths, PALETTE[i % len(PALETTE)], label, keeps, touching[i], way))
+        shown.append(Course(b, X, U, moments, PALETTE[i % len(PALETTE)], label, keeps, touching[i], way))
     return shown, unit
 
 
@@ -250,13 +246,13 @@ class SceneMap:
     @classmethod
     def of(cls, problem: Problem, courses: list[Course], planes: tuple[Plane, ...]) -> SceneMap:
         world = world_of(problem, courses[0].b)
-        kept, others = ([flown(p) for c in courses for p in c.paths if c.keeps == which] for which in (True, False))
+        kept, others = ([flown(p) for c in courses for p in c.way.paths if c.keeps == which] for which in (True, False))
         gates, inside = outlines(problem, courses[0].b), [view(scene, [0], kept, others) for scene in world.scenes]
         for course in courses:
             for scene in world.scenes:
-                inside += moving_corners(scene, 0, course.paths[0])
+                inside += moving_corners(scene, 0, course.way.paths[0], course.way.clock)
             if world.body is not None and course.keeps:
-                inside.append(world.body.extent(course.X[: len(flown(course.paths[0]))]))
+                inside.append(world.body.extent(flown(course.X)))
         inside += [corners + sign * radius for corners, radius in gates for sign in (-1.0, 1.0)]
         points = np.concatenate(inside)
         box = np.stack([points.min(axis=0), points.max(axis=0)])
@@ -288,7 +284,7 @@ class SceneMap:
 
     def _plane(self, ax: Axes, plane: Plane) -> set[str]:
         ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]], aspect="equal")
-        lead = flown(self.courses[0].paths[0])
+        lead = flown(self.courses[0].way.paths[0])
         drawn = self._obstacles(ax, plane, lead)
         for course in self.courses:
             drawn |= self._course(ax, plane, course)
@@ -296,21 +292,19 @@ class SceneMap:
         draw_gates(ax, self.gates, plane)
         for course in self.courses[1:]:
             start: dict[str, Any] = {"marker": "s", "markersize": 5, "markeredgecolor": "white", "markeredgewidth": 0.5}
-            ax.plot(*course.paths[0][:1, plane].T, color=INK, zorder=2.5, linestyle="none", **start)
+            ax.plot(*course.way.paths[0][:1, plane].T, color=INK, zorder=2.5, linestyle="none", **start)
         ax.set(xlim=self.box[:, plane[0]], ylim=self.box[:, plane[1]])
         ax.set(xlabel="x [m]" if plane == self.planes[-1] else "", ylabel=f"{'xyz'[plane[1]]} [m]")
         words = {ABOVE: "from above", SIDE: "from the side"}
-        tidy(
-            ax,
-            f"{words[plane]}, obstacles cut where problem {self.courses[0].b} flies" if len(self.planes) > 1 else "",
-            grid=None,
-        )
+        told = f"{words[plane]}, obstacles cut where problem {self.courses[0].b} flies" if len(self.planes) > 1 else ""
+        tidy(ax, told, grid=None)
         return drawn
 
     def _obstacles(self, ax: Axes, plane: Plane, lead: np.ndarray) -> set[str]:
         drawn = set[str]()
         for scene in self.world.scenes:
-            leads = {course.colour: passes(scene, 0, course.paths[0]) for course in self.courses}
+            ways = {course.colour: course.way for course in self.courses}
+            leads = {colour: passes(scene, 0, way.paths[0], way.clock) for colour, way in ways.items()}
             drawn |= draw_obstacles(ax, scene, 0, leads, plane)
             if scene.map is not None:
                 drawn |= draw_map(ax, scene.map, lead if len(lead) else scene.start, plane, scene.margin, (ROCK, EDGE))
@@ -320,26 +314,23 @@ class SceneMap:
         """Draw a trajectory, where it touches something, and where it leaves the picture."""
         drawn = set[str]()
         look: dict[str, Any] = {"color": course.colour, "zorder": 3}
-        for path, way in zip(course.paths, course.way.paths, strict=True):
-            shown = flown(way)[:, plane]
-            knots: dict[str, Any] = {"marker": ".", "markersize": 3, "linewidth": 1.2}
-            if course.way.pieces > 1:
-                ax.plot(*shown.T, linewidth=1.2, **look)
-                knots["linewidth"] = 0.0
-            ax.plot(*flown(path)[:, plane].T, **knots, **look)
+        for path in course.way.paths:
+            shown = flown(path)[:, plane]
+            ax.plot(*shown.T, linewidth=1.2, marker=".", markersize=3, markevery=course.way.pieces, **look)
             if (away := leaving(self.box[:, plane], shown)) is not None:
                 ax.plot(*away[0][:, None], color=course.colour, zorder=6, clip_on=False, **marker("away", away[1]))
                 drawn.add("away")
         if self.world.body is not None:
-            self.world.body.draw(ax, course.X[: len(flown(course.paths[0]))], plane, course.colour)
+            self.world.body.draw(ax, flown(course.X), plane, course.colour)
             drawn.add("body")
-        if not course.touches:
-            return drawn
-        way = flown(course.way.paths[0])
-        touched = contacts(self.world.obstacles, way, self.world.first.dt / course.way.pieces, course.way.X[: len(way)])
-        if len(touched):
-            ax.plot(*touched[:, plane].T, color=course.colour, zorder=4, **marker("contact"))
-            drawn.add("contact")
+        way, path = course.way, flown(course.way.paths[0])
+        marks = {"passed": way.crossings}
+        if course.touches and len(path) > 0:
+            marks["contact"] = contacts(self.world.obstacles, path, float(way.clock[1]), way.X[: len(path)])
+        for kind, places in marks.items():
+            if len(places):
+                ax.plot(*places[:, plane].T, color=course.colour, zorder=4, **marker(kind))
+                drawn.add(kind)
         return drawn
 
 
@@ -351,12 +342,10 @@ def _handles(maps: Sequence[SceneMap], drawn: set[str]) -> list[Artist]:
         "body": Patch(facecolor="none", edgecolor=INK, label="the vehicle's body, at some knots"),
         "others": Patch(facecolor=ROCK, label="obstacle, plus the vehicle's radius"),
     }
-    points: list[Artist] = [
-        Line2D([], [], color=INK, label=MARKED[kind], **marker(kind)) for kind in ("contact", "away") if kind in drawn
-    ]
     of_maps = [handle for map_ in maps for scene in map_.world.scenes for handle in map_handles(scene.map)]
     moving = moving_handles("the trajectory of its colour", INK) if "moving" in drawn else []
     known = {handle.get_label(): handle for handle in reversed(of_maps)}
+    points = marked(drawn, maps[0].world.first)
     return [*points, *(shape for kind, shape in shapes.items() if kind in drawn), *moving, *known.values()]
 
 

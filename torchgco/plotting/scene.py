@@ -33,7 +33,6 @@ class Scene:
         start, goal: (L, d), nan where unknown.
         margin: the vehicle's radius, 0 where unknown.
         goal_radius: nan where unknown.
-        dt: s, 0 where unknown: moving obstacles are then drawn where they start.
         ids: (L,) index of each layout in its file or generator.
         map: of all layouts, or one of each, or None.
         body: the vehicle's, in the place of the margin; None: it is a ball.
@@ -49,7 +48,6 @@ class Scene:
     goal: np.ndarray
     margin: float
     goal_radius: float
-    dt: float
     ids: np.ndarray
     map: DistanceField | None = None
     gates: np.ndarray | None = None
@@ -105,7 +103,6 @@ def scene_of(
         goal=point("goal"),
         margin=float(layouts.get("vehicle_radius", 0.0)) if body is None else 0.0,
         goal_radius=float(layouts.get("goal_radius", np.nan)),
-        dt=float(layouts.get("dt", 0.0)),
         ids=np.asarray(layouts.get("layout", np.arange(count))),
         map=map_of(layouts),
         gates=gates_in(layouts),
@@ -136,20 +133,19 @@ def flown(path: np.ndarray) -> np.ndarray:
     return path if finite.all() else path[: int(finite.argmin())]
 
 
-def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
-    """Where a path (N+1, d) passes each obstacle of layout i; without knots, every obstacle where it starts.
+def passes(scene: Scene, i: int, path: np.ndarray, t: np.ndarray) -> list[Pass]:
+    """Where a path (T, d) with times (T,), s, passes each obstacle of layout i; without one, each where it starts.
 
     An obstacle at rest is passed where the path has its x (where it has it several times, at the closest of these
-    knots), a moving one where it comes closest.
+    places), a moving one where it comes closest.
     """
     path, closest = flown(path), []
-    t = scene.dt * np.arange(len(path))
     step = np.abs(np.diff(path[:, 0])).max(initial=0.0)
     for body in scene.bodies[i]:
         if len(path) == 0:
             closest.append(Pass(body.at(0.0), 0.0, 0.0))
             continue
-        apart = body.distance(path, t)
+        apart = body.distance(path, t[: len(path)])
         k = int(apart.argmin())
         least = float(apart[k] - body.radius - scene.margin)
         if not body.moving:
@@ -159,15 +155,16 @@ def passes(scene: Scene, i: int, path: np.ndarray) -> list[Pass]:
     return closest
 
 
-def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
-    """Places (C, d) where a path (N+1, d) touches obstacles or the map of layout i: the deepest of each contact.
+def contacts(scene: Scene, i: int, path: np.ndarray, t: np.ndarray, states: np.ndarray | None = None) -> np.ndarray:
+    """Places (C, d) where a path (T, d) touches obstacles or the map of layout i: the deepest of each contact.
 
-    Bodies touch, and distances are measured, as by the judge; between the knots the
-    path is straight, and the states (N+1, n) change evenly, by which a vehicle's body turns.
+    Bodies touch, and distances are measured, as by the judge; between even times (T,), s, the
+    path is straight, and the states (T, n) change evenly, by which a vehicle's body turns.
     """
+    dt = float(t[1]) if len(t) > 1 else 0.0
     if scene.obstacles is not None:
         kept = None if states is None else states[: len(flown(path))]
-        return contact.contacts(scene.obstacles[i], flown(path), scene.dt, kept)
+        return contact.contacts(scene.obstacles[i], flown(path), dt, kept)
     places, knots = pieces(flown(path))
     depth = np.full(max(len(places) - 1, 0), -np.inf)
     if len(places) == 0:
@@ -179,7 +176,7 @@ def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None =
     for ball, margin in balls:
         for body in scene.bodies[i]:
             reach = CONTACT_FACTOR * (body.radius + margin)
-            depth = np.maximum(depth, reach - body.along(ball, scene.dt * knots, reach))
+            depth = np.maximum(depth, reach - body.along(ball, dt * knots, reach))
         if (field := scene.map_of(i)) is not None:
             depth = np.maximum(depth, map_depth(field, ball, margin))
     return deepest(places, depth)
@@ -188,13 +185,16 @@ def contacts(scene: Scene, i: int, path: np.ndarray, states: np.ndarray | None =
 def view(scene: Scene, shown: Iterable[int], whole: list[np.ndarray], others: list[np.ndarray]) -> np.ndarray:
     """Lower and upper corner (2, d), m, of a map of the layouts `shown`.
 
-    Starts, goals and the paths of `whole`, (N+1, d) each, are inside, and of `others` those that stay near these or on
-    the map of cells or points. Obstacles and paths that go farther widen the picture only by a share of its size, as a
-    long wall or a diverged path would shrink all the rest to a dot.
+    Starts, goals, gates and the paths of `whole`, (N+1, d) each, are inside, and of `others` those that stay near these
+    or on the map of cells or points. Obstacles and paths that go farther widen the picture only by a share of its size,
+    as a long wall or a diverged path would shrink all the rest to a dot.
     """
     shown = list(shown)
     ring = np.nan_to_num(scene.goal_radius)
     ends = [scene.start[shown], scene.goal[shown] - ring, scene.goal[shown] + ring]
+    if scene.gates is not None:
+        balls = scene.gates[shown].reshape(-1, scene.dimension + 1)
+        ends += [balls[:, :-1] - balls[:, -1:], balls[:, :-1] + balls[:, -1:]]
     edges = [_extent(body, scene.margin) for i in shown for body in scene.bodies[i] if not body.moving]
     if scene.map is not None:
         edges += [np.stack([low, high]) for low, high in zip(scene.map.origin, scene.map.upper, strict=True)]
@@ -294,13 +294,12 @@ def world_of(problem: Problem, b: int) -> World:
     goal, radius = np.full_like(start, np.nan), np.nan
     if single.goal is not None:
         goal, radius = single.goal.position.cpu().numpy(), float(single.goal.radius[0])
-    dt = float(getattr(single.dynamics, "dt", None) or 0.0)
     none: dict[float, list[Solid]] = {} if maps else {0.0: []}
     scenes = [
-        Scene((tuple(bodies),), start, goal, vehicle, radius, dt, np.array([b]))
+        Scene((tuple(bodies),), start, goal, vehicle, radius, np.array([b]))
         for vehicle, bodies in (by_radius or none).items()
     ]
-    scenes += [Scene(((),), start, goal, vehicle, radius, dt, np.array([b]), field) for vehicle, field in maps]
+    scenes += [Scene(((),), start, goal, vehicle, radius, np.array([b]), field) for vehicle, field in maps]
     return World(tuple(scenes), tuple(others), tuple(single.obstacles), VehicleBody.of(single))
 
 

@@ -25,6 +25,7 @@ from torchgco.plotting.rates import OUTCOMES
 from torchgco.plotting.scene import Arrays, Scene, scene_of
 from torchgco.plotting.style import DASHES, INK, TEXT, legend_columns, solver_colours, solver_handles, tidy
 from torchgco.plotting.vehicle_body import VehicleBody
+from torchgco.plotting.ways import Ways
 
 Columns = Literal["one", "two"]
 COSTLIEST = 2.0  # times the best known cost, where the axis of costs ends
@@ -57,7 +58,7 @@ STUDY_MARGIN = 0.55  # inches at the left of a chart, whose labels are wider tha
 
 def study_figure(
     layouts: Arrays,
-    trajectories: Arrays,
+    trajectories: Ways,
     trials: pd.DataFrame,
     summary: pd.DataFrame,
     columns: Columns = "two",
@@ -84,7 +85,7 @@ def study_figure(
         raise InputError("summary", "one scenario and model", summary[["scenario", "model"]].drop_duplicates().values)
     form, scene = PRINTS[columns], scene_of(layouts, body, position, obstacles)
     count = min(len(layouts["radii"]), 2 * form.maps)
-    flights = flights_of(scene, {name: np.asarray(X[:count]) for name, X in trajectories.items()}, trials)
+    flights = flights_of(scene, {name: ways[:count] for name, ways in trajectories.items()}, trials)
     boxes = views(scene, flights, count, min(form.maps, count))
     handles = _handles(summary, form, scene, ends(scene, flights, boxes, min(form.maps, count)))
     figure, maps, charts = _frame(boxes, count, form, handles)
@@ -191,6 +192,7 @@ def _shrink(figure: Figure, form: Print) -> None:
         ax.xaxis.labelpad = ax.yaxis.labelpad = 1
         for spine in ax.spines.values():
             spine.set_linewidth(0.5)
+        for shape in (*ax.lines, *ax.patches):
+            shape.set_linewidth(form.thin * shape.get_linewidth())
         for line in ax.lines:
-            line.set_linewidth(form.thin * line.get_linewidth())
             line.set_markersize(form.thin * line.get_markersize())

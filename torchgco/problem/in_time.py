@@ -156,17 +156,6 @@ def guessing_times(problem: Problem, times: Any) -> Problem:
     return problem._with({"time": replace(problem.time, guess=guess)}, problem.known)
 
 
-def paced(problem: Problem, times: Tensor | None) -> Problem:
-    """The user's problem with obstacles that move in a stage of dt as they do in one at the times (B, N+1), s.
-
-    Itself where none moves, or the time isn't free.
-    """
-    if problem.time is None or times is None or not any(obstacle.moving for obstacle in problem.obstacles):
-        return problem
-    factor = factors_of(problem, times)[:, 0]
-    return problem._with({"constraints": tuple(constraint.paced(factor) for constraint in problem.constraints)})
-
-
 def at_held_times(problem: Problem, n: int) -> Problem:
     """Problems `in_time` whose factor, their state n, is held at x0, and whose own starts stay as free as they are."""
     free = problem.free_start

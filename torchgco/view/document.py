@@ -19,7 +19,7 @@ from torchgco.plotting.gates import outlines
 from torchgco.plotting.style import solver_colours
 from torchgco.plotting.vehicle_body import VehicleBody
 from torchgco.plotting.ways import ways_along
-from torchgco.problem.in_time import paced
+from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
 from torchgco.view.packing import LARGEST_HALF, Packing, number
 from torchgco.view.sensed import Sensed
@@ -72,6 +72,7 @@ class ShownFlight:
         violation: (K,) the largest violation at each knot; m for lengths.
         worst: (K,) int: of which constraint; -1 where nothing is violated.
         contacts: (C, d) places where bodies touch, between knots too.
+        crossings: (C', d) places where gates are passed.
         plan: (K, P, d) what the vehicle planned at each knot, of missions; None: nothing.
         notes: one text per knot for the hover, of missions; none: nothing to say.
         sensed: what the vehicle saw and sought, of missions with a sensor.
@@ -88,6 +89,7 @@ class ShownFlight:
     violation: np.ndarray
     worst: np.ndarray
     contacts: np.ndarray
+    crossings: np.ndarray
     plan: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
     sensed: Sensed | None = None
@@ -110,7 +112,8 @@ class ShownFlight:
         """As the page reads it, under the number of its solver."""
         entry: dict[str, Any] = {
             "solver": number_of, "result": self.result, "rows": self.rows, "notes": self.notes,
-            "contacts": np.round(self.contacts, 3).tolist(), "path": packing.put(self.path, steps=True),
+            "contacts": np.round(self.contacts, 3).tolist(), "crossings": np.round(self.crossings, 3).tolist(),
+            "path": packing.put(self.path, steps=True),
         }  # fmt: skip
         if self.attitude is not None:
             entry["attitude"] = packing.put(self.attitude)
@@ -129,11 +132,18 @@ class ShownFlight:
         return entry
 
 
-def violated(problem: Problem, X: Tensor, U: Tensor, admitted: float) -> tuple[np.ndarray, np.ndarray]:
-    """The largest violation (B, N+1) of each knot above `admitted`, and of which constraint; 0 and -1 elsewhere."""
+def violated(
+    problem: Problem, X: Tensor, U: Tensor, admitted: float, times: Tensor | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The largest violation (B, N+1) of each knot above `admitted`, and of which constraint; 0 and -1 elsewhere.
+
+    Args:
+        times: of the knots (B, N+1), s, where the time is free.
+    """
+    whole, X, U = at_times(problem, X, U, times)
     most = X.new_full((problem.B, problem.N + 1), admitted)
     worst = torch.full_like(most, -1, dtype=torch.int64)
-    for index, constraint in enumerate(problem.constraints):
+    for index, constraint in enumerate(whole.constraints[: len(problem.constraints)]):  # before those of the time
         rows = constraint.violation(X, U)
         if rows.numel() == 0:
             continue
@@ -181,9 +191,7 @@ def flights_of(
         touching: (B,) bool: where contact is looked for.
         times: of the knots (B, N+1), s, where the time is free.
     """
-    moving = paced(problem, times)
-    (violation, worst), flights = violated(moving, X, U, admitted), []
-    dt = getattr(problem.dynamics, "dt", None) or 1.0
+    (violation, worst), flights = violated(problem, X, U, admitted, times), []
     states, body = X.detach().cpu().double().numpy(), VehicleBody.of(problem)
     ways = ways_along(problem, X, U, times, [range(problem.n)[problem.position]])
     for b, way in enumerate(ways):
@@ -193,11 +201,11 @@ def flights_of(
         places = path[:0]
         bad, which = violation[b, knots], worst[b, knots]
         if touching[b] and len(path):
-            single = moving.take(torch.tensor([b], device=X.device))
-            places = contacts(single.obstacles, fine[:, problem.position], dt / way.pieces, fine)
+            single = problem.take(torch.tensor([b], device=X.device))
+            places = contacts(single.obstacles, fine[:, problem.position], float(way.clock[1]), fine)
         told = [*rows[b], *worst_row(problem, bad, which)]
         attitude = look.attitude(kept) if body is None else turned(body, kept)
-        flight = ShownFlight(solver, path, attitude, results[b], told, bad, which, places)
+        flight = ShownFlight(solver, path, attitude, results[b], told, bad, which, places, way.crossings)
         if way.pieces > 1:
             flight = replace(flight, way=fine[:, problem.position], pieces=way.pieces)
         flights.append(flight if times is None else replace(flight, times=times[b, knots].cpu().double().numpy()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ from torchgco.experiments.results.provenance import recorded
 from torchgco.explaining.advice import Facts, advice
 from torchgco.explaining.explain import LINE_WIDTH, explanation, map_facts
 from torchgco.missions import Mission
+from torchgco.plotting.ways import Way, ways_along
 from torchgco.scenarios import Layouts, Task
 
 EXPLAINED = 8  # layouts at most
@@ -242,7 +244,7 @@ def _report(study: _Study, folder: Path) -> str:
     plan = study.plan
     if study.layouts.vehicles is not None:
         return write_fleet_report(folder, study.setup.vehicle, study.layouts, plan.figures)
-    return write_report(folder, lambda flown: _trajectories(study, flown), plan.figures, plan.figure, study.tasks)
+    return write_report(folder, partial(_trajectories, study), plan.figures, plan.figure, study.tasks)
 
 
 def _study(configuration: dict[str, Any], recompose: Recompose) -> _Study:
@@ -344,16 +346,15 @@ def _update(study: _Study, store: StudyFolder, swept: Sequence[str]) -> None:
         say("The best costs of the layouts have changed: best_cost and success were computed again.\n")
 
 
-def _trajectories(study: _Study, flown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """States (L, N+1, n) of every solver, for the pictures; those with fewer stages stay where they end."""
+def _trajectories(study: _Study, flown: Mapping[str, np.ndarray], count: int) -> dict[str, list[Way]]:
+    """The trajectories of every solver through the first `count` layouts, for the pictures."""
     names, every, times = flown["solver"].tolist(), flown["U"], flown.get("times")
-    states = {name: np.full((*U.shape[:1], U.shape[1] + 1, study.setup.vehicle.dynamics.n), np.nan)
-             for name, U in zip(names, every, strict=True)}  # fmt: skip
-    for places in study.tasks.groups:
+    ways = {name: dict[int, Way]() for name in names}
+    for places in (shown for group in study.tasks.groups if len(shown := group[group < count])):
         problem = study.tasks.of(places, exact=True).problem
         for i, name in enumerate(names):
             U = torch.from_numpy(every[i][places, : problem.N])
             t = times_at(None if times is None else times[i], places, problem.N)
-            X = states_of(problem, U, t).numpy()
-            states[name][places, : problem.N + 1], states[name][places, problem.N + 1 :] = X, X[:, -1:]
-    return states
+            along = ways_along(problem, states_of(problem, U, t), U, t, [])
+            ways[name] |= dict(zip(places.tolist(), along, strict=True))
+    return {name: [by_place[place] for place in sorted(by_place)] for name, by_place in ways.items()}

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchgco.base.errors import InputError
 from torchgco.base.memory import limited
+from torchgco.constraints.gates import gates_of
 from torchgco.experiments.config.build import mission_from, solver_from, vehicle_of
 from torchgco.experiments.flying.progress import page_bar
 from torchgco.experiments.results.durations import times_at
@@ -36,6 +37,7 @@ from torchgco.experiments.results.identity import Manifest
 from torchgco.experiments.results.limits import LARGEST_FILE, check_stages, read_layouts, read_log, read_npz, read_table
 from torchgco.exploration.mission import replayed
 from torchgco.judging.contact import contacts
+from torchgco.judging.gates import crossings, through_balls
 from torchgco.missions import Mission
 from torchgco.missions.outcome import STATES
 from torchgco.native.compiler import NativeError
@@ -250,10 +252,12 @@ def _flight(problem: Problem, solver: str, steps: pd.DataFrame, row: Mapping[str
     path, clear = X[:, :3], steps["clearance"].to_numpy(dtype=float)
     bad = np.where(clear < 0, -clear, 0.0)[: len(path)]
     index = next((i for i, constraint in enumerate(problem.constraints) if constraint in problem.obstacles), -1)
+    gates = None if len(path) < 2 else gates_of(problem)
+    passed = [] if gates is None else [through_balls(gates.centers, gates.sizes, torch.tensor(path[None]))]
     return ShownFlight(
         solver, path, QUADROTOR.attitude(X), "reached" if row["reached"] is True else "failed", _told(row), bad,
         np.where(bad > 0, index, -1), contacts(problem.obstacles, path, float(problem.dynamics.dt), X),
-        notes=_notes(steps)[: len(path)],
+        crossings(passed), notes=_notes(steps)[: len(path)],
     )  # fmt: skip
 
 

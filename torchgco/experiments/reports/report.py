@@ -61,6 +61,7 @@ from torchgco.plotting.rates import rates_figure, sweep_figure
 from torchgco.plotting.study_figure import Columns, study_figure
 from torchgco.plotting.style import save
 from torchgco.plotting.vehicle_body import VehicleBody
+from torchgco.plotting.ways import Ways
 from torchgco.scenarios import Layouts, Vehicle
 
 Drawings = dict[str, Callable[[], Figure]]
@@ -72,7 +73,7 @@ Arrays = Mapping[str, np.ndarray]
 
 def write_report(
     folder: Path,
-    trajectories: Callable[[Arrays], Arrays] | None = None,
+    trajectories: Callable[[Arrays, int], Ways] | None = None,
     figures: bool = True,
     printed: Columns | None = None,
     tasks: Tasks | None = None,
@@ -83,8 +84,8 @@ def write_report(
     """Write `summary.csv`, `paired.csv` and `figures/*.png` next to the `trials.parquet` in a folder; return the table.
 
     Args:
-        trajectories: states for the picture of the layouts, X (L, N+1, n) by solver in the order of `layouts.npz`, from
-            the arrays of `solutions.npz`; None: no such picture.
+        trajectories: of so many of the first layouts in `layouts.npz`, by solver, for their picture, from the arrays of
+            `solutions.npz`; None: no such picture.
         figures: False: tables alone.
         printed: columns of a paper that a figure of the whole study spans, study.pdf; None: no such figure.
         tasks: of the study, whose numbers these pictures show where layouts have none; None: layouts have all that is
@@ -102,16 +103,15 @@ def write_report(
     to_draw = {name: figure for part in parts for name, figure in drawings(part).items()} if figures else {}
     if (figures or printed) and trajectories is not None:
         stored = Layouts.load(folder / LAYOUTS)
-        layouts, how = _posed(stored.take(range(min(stored.count, SHOWN_LAYOUTS))), tasks)
+        count = min(stored.count, SHOWN_LAYOUTS)
+        layouts, how = _posed(stored.take(range(count)), tasks)
         with np.load(folder / SOLUTIONS, allow_pickle=False) as solutions:
-            states = {name: X[:SHOWN_LAYOUTS] for name, X in trajectories(solutions).items()}
+            ways = trajectories(solutions, count)
         if figures:
-            to_draw["layouts"] = lambda: layout_grid(layouts, states, trials, **how)
+            to_draw["layouts"] = lambda: layout_grid(layouts, ways, trials, **how)
         if printed:
-            for ending in ("png", "pdf"):
-                to_draw[f"study.{ending}"] = lambda: study_figure(
-                    layouts, states, trials, parts[0].summary, printed, **how
-                )
+            for kind in ("png", "pdf"):
+                to_draw[f"study.{kind}"] = lambda: study_figure(layouts, ways, trials, parts[0].summary, printed, **how)
     if pdf:
         to_draw = {name if name.startswith("study.") else f"{name}.pdf": figure for name, figure in to_draw.items()}
     draw({name: partial(_draw, folder, name, figure) for name, figure in to_draw.items()})

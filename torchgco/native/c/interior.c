@@ -236,8 +236,9 @@ TGCO_LARGE I soften(Barrier *t, const Track *k, I moving) {
     }
 }
 
-/* Lanes whose line search failed look for feasibility alone: steps of least length that close residuals. Where there is
-   nothing to close, they start anew with new multipliers and a shift. Returns the lanes that give up. */
+/* Lanes whose line search failed, or that no shift gives a step, look for feasibility alone: steps of least length that
+   close residuals. Where there is nothing to close, they start anew with new multipliers and a shift. Returns the lanes
+   that give up. */
 TGCO_LARGE I recover(Barrier *t, Track *k, I failed) {
     const Interior *how = t->how;
     I renewed = failed & NOT(failed), lost = renewed;
@@ -376,11 +377,7 @@ TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error)
     k->last = tgco_choose(moving & (t->shift > SET(0.0)), t->shift, k->last);
     astray = running & NOT(moving) & k->watching;
     if (any(astray)) go_back(t, k, astray);
-    for (int l = 0; l < LANES; l++)
-        if (LANE(running, l) && !LANE(moving, l) && !LANE(astray, l)) {
-            status[l] = LANE(small, l) ? CONVERGED : NOT_POSITIVE_DEFINITE;
-            LANE(ended, l) = -1;
-        }
+    I without = running & NOT(moving) & NOT(astray);
     V tau = least(most(SET(how->tau_min), SET(1.0) - t->mu), SET(how->tau_max));
     I won = search(t, k, moving, tau);
     k->made += tgco_truth(running);
@@ -392,9 +389,13 @@ TGCO_LARGE I iterate(Barrier *t, Track *k, I running, int32_t *status, V *error)
     t->soft = tgco_choose(won, most(SET(how->jacobian_regularization_value), SET(how->soft_decay) * t->soft), t->soft);
     residuals(t, t->c, t->s, t->r);
     for (int l = 0; l < LANES; l++) if (LANE(won, l) && !LANE(k->restoring, l) && LANE(k->forced, l) == 0) k->failures[l] = 0;
-    for (int l = 0; l < LANES; l++) if (LANE(moving, l) && !LANE(won, l) && LANE(small, l)) { status[l] = CONVERGED; LANE(ended, l) = -1; }
-    I lost = recover(t, k, moving & NOT(won) & NOT(small));
-    for (int l = 0; l < LANES; l++) if (LANE(lost, l)) { status[l] = LINE_SEARCH_FAILED; LANE(ended, l) = -1; }
+    I stopped = (moving & NOT(won)) | without;
+    for (int l = 0; l < LANES; l++) if (LANE(stopped, l) && LANE(small, l)) { status[l] = CONVERGED; LANE(ended, l) = -1; }
+    I lost = recover(t, k, stopped & NOT(small));
+    for (int l = 0; l < LANES; l++) if (LANE(lost, l)) {
+        status[l] = LANE(without, l) ? NOT_POSITIVE_DEFINITE : LINE_SEARCH_FAILED;
+        LANE(ended, l) = -1;
+    }
     resume(t, k);
     return ended;
 }

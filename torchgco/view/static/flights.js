@@ -92,15 +92,15 @@ export class Flights {
     const { radius, shape, body: kind } = flight.phase ?? this.head;
     const body = vehicle(kind, radius || 0.012 * this.space.size, colour, this.space.flat, shape);
     body.add(dot(colour));
-    group.add(body, ...this.marks(flight, drawn));
+    group.add(body, ...this.marks(flight, drawn, colour));
     const parts = flight.plan ? new MissionParts(flight, colour, this.space) : null;
     if (parts) group.add(parts.group);
     this.group.add(group);
     return { flight, name, colour, group, points, drawn, line, body, parts };
   }
 
-  /** Red where a constraint is violated, and a red mark at each contact. */
-  marks(flight, points) {
+  /** Red where a constraint is violated, a red mark at each contact, and one in the flight's colour where it passes a gate. */
+  marks(flight, points, colour) {
     const found = [];
     const pieces = flight.pieces ?? 1;
     const paint = new THREE.MeshLambertMaterial({ color: BAD });
@@ -109,22 +109,25 @@ export class Flights {
       const red = piece.length > 1 ? tube(piece, 1.8 * this.thick, paint) : null;
       if (red) found.push(red);
     }
-    if (flight.contacts.length) {
-      // They lie within what is touched: seen through it.
-      const through = new THREE.MeshBasicMaterial({ color: BAD, transparent: true, opacity: 0.6, depthTest: false, depthWrite: false });
-      for (const [look, order] of [[paint, 0], [through, 6]]) {
-        const shapes = new THREE.InstancedMesh(new THREE.OctahedronGeometry(3.2 * this.thick), look, flight.contacts.length);
-        const at = new THREE.Matrix4();
-        flight.contacts.forEach((place, i) => {
-          const { x, y, z } = this.place(...place);
-          shapes.setMatrixAt(i, at.makeTranslation(x, y, z));
-        });
-        shapes.frustumCulled = false;
-        shapes.renderOrder = order;
-        found.push(shapes);
-      }
-    }
-    return found;
+    // They lie within what is touched: seen through it.
+    const through = new THREE.MeshBasicMaterial({ color: BAD, transparent: true, opacity: 0.6, depthTest: false, depthWrite: false });
+    const solid = new THREE.OctahedronGeometry(3.2 * this.thick);
+    found.push(...this.placed(flight.contacts, solid, paint, 0), ...this.placed(flight.contacts, solid, through, 6));
+    const disc = new THREE.SphereGeometry(2.4 * this.thick);
+    return [...found, ...this.placed(flight.crossings, disc, new THREE.MeshLambertMaterial({ color: colour }), 0)];
+  }
+
+  /** A shape at each of some places. */
+  placed(places, shape, look, order) {
+    const shapes = new THREE.InstancedMesh(shape, look, places.length);
+    const at = new THREE.Matrix4();
+    places.forEach((place, i) => {
+      const { x, y, z } = this.place(...place);
+      shapes.setMatrixAt(i, at.makeTranslation(x, y, z));
+    });
+    shapes.frustumCulled = false;
+    shapes.renderOrder = order;
+    return places.length ? [shapes] : [];
   }
 
   /** Move all vehicles to a time, s. */
