@@ -81,7 +81,7 @@ def test_a_period_needs_no_whole_stage(period: float) -> None:
 @pytest.mark.parametrize("late", [False, True])
 @pytest.mark.parametrize("period", [0.13, 0.2, 0.3])
 def test_a_period_of_several_stages_keeps_what_its_plan_keeps(period: float, late: bool) -> None:
-    """The speed at its end is the plan's: with the controls of the first stage alone it was 0.25 m/s above its limit."""
+    """The speed at its end is the plan's: the first stage's controls alone led 0.25 m/s above the limit."""
     cart = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, DT, "rk4", position=slice(0, 1))
     parts = [ControlBounds(-2.0, 1.5), StateBounds([-np.inf, -2.0], [np.inf, 2.0])]
     problem = Problem(cart, QuadraticCost([1, 0.1], [0.01], [5, 1], x_ref=[8.0, 0.0]), parts, [0.0, 0.0], 40)

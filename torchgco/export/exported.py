@@ -20,8 +20,8 @@ NEAR = 1e-3  # of the range of controls along the test's plans, that those in si
 
 
 FIXED_NOTE = """\
-- `stages` is by how many stages of {} s time has gone on since the last step; parts of one count, too. Where a period has
-  several, u is the plan's mean over `w.period`, s: set it to yours."""
+- `stages` is by how many stages of {} s time has gone on since the last step; parts of one count, too. Where a period
+  has several, u is the plan's mean over `w.period`, s: set it to yours."""
 FREE_NOTE = """\
 - The third argument is the time since the last step, s. `w.t` has the times of the plan's knots, s, and u is the plan's
   mean over `w.period`, s: set it to yours. The first step begins with a plan that was found when this was written."""
