@@ -90,6 +90,13 @@ def test_half_a_stage() -> None:
     torch.testing.assert_close(controller.U, want, rtol=0, atol=1e-8)
 
 
+def test_a_period_of_several_stages() -> None:
+    """The vehicle gets the mean of what the plan flies until the next command."""
+    controller = MPPIController(held_up([[0.4, 0.0]]), SAMPLER, period=2.5 * DT)
+    u, U = controller.command([0.4, 0.0]), controller.U[0]
+    torch.testing.assert_close(u, (U[0] + U[1] + 0.5 * U[2]) / 2.5, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("act", "message"),
     [

@@ -23,6 +23,7 @@ from torchgco import (
     QuadraticCost,
     RateBounds,
     Spheres,
+    StateBounds,
     Status,
 )
 from torchgco.native import compiler
@@ -71,14 +72,33 @@ def test_a_period_needs_no_whole_stage(period: float) -> None:
         assert mpc.statuses == [Status.CONVERGED]
         if k % 10 == 9:
             fresh = torchgco.compile(driven(), "interior_point")(x0=x, x_ref=path(period * k))
-            torch.testing.assert_close(u, fresh.u[0], rtol=0, atol=1e-3)
+            lasts = np.clip(period - DT * np.arange(N), 0.0, DT) / period  # shares of the period
+            torch.testing.assert_close(u, torch.from_numpy(lasts @ fresh.U[0].numpy()), rtol=0, atol=1e-3)
         x = rk4(x, u.numpy(), period)
     assert iterations < 30 * 7  # a solve from rest takes 12
 
 
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("period", [0.13, 0.2, 0.3])
+def test_a_period_of_several_stages_keeps_what_its_plan_keeps(period: float, late: bool) -> None:
+    """The speed at its end is the plan's: the first stage's controls alone led 0.25 m/s above the limit."""
+    cart = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, DT, "rk4", position=slice(0, 1))
+    parts = [ControlBounds(-2.0, 1.5), StateBounds([-np.inf, -2.0], [np.inf, 2.0])]
+    problem = Problem(cart, QuadraticCost([1, 0.1], [0.01], [5, 1], x_ref=[8.0, 0.0]), parts, [0.0, 0.0], 40)
+    mpc, (p, v) = MPC(problem, period=period, max_seconds=float("inf")), (0.0, 0.0)
+    for k in range(round(6.0 / period)):
+        u = float(mpc.step([p, v], max_seconds=1e-9 if late and k % 3 == 2 else None))
+        assert bool(mpc.held) == (late and k % 3 == 2) and bool(mpc.feasible)
+        p, v = p + period * (v + 0.5 * period * u), v + period * u
+        assert abs(v) <= 2.001
+        np.testing.assert_allclose(mpc.plan.at(mpc.t + period).x[0], [p, v], rtol=0, atol=0.05)
+    assert abs(p - 8.0) < 0.1 and abs(v) < 0.1
+
+
 def test_steps_come_when_they_come() -> None:
     """Times that are told move the plan by what lies between them."""
-    told, regular, x = MPC(driven()), MPC(driven(), period=0.25, max_seconds=float("inf")), START
+    told, regular = (MPC(driven(), period=0.25, max_seconds=float("inf")) for _ in range(2))
+    x = START
     for k in range(6):
         u = regular.step(x, x_ref=path(0.25 * k))
         assert torch.equal(told.step(x, t=7.0 + 0.25 * k, x_ref=path(0.25 * k)), u)

@@ -30,7 +30,7 @@ from torchgco.problem.alone import check_rows
 from torchgco.problem.horizons import as_solved
 from torchgco.problem.problem import Problem, current_problem
 from torchgco.receding.holding import Held, better, clamped, held
-from torchgco.receding.plan import Plan, stages_between
+from torchgco.receding.plan import Plan, mean_controls, stages_between
 from torchgco.solution import Solution
 
 
@@ -49,8 +49,8 @@ class MPC:
     a stage's change as the period is of the stage. Obstacles that move go on by themselves where a step doesn't say
     where they are.
 
-    Where the time is free, a plan lasts as long as is left of the one before, or as is best. Controls are the plan's
-    means over the next period, and of stages that are longer those of the first.
+    Controls are the plan's means over the next period: in periods longer than a stage those of several ones. Where the
+    time is free, a plan lasts as long as is left of the one before, or as is best.
 
     Args:
         problem: B vehicles with stages of one length, or a free time; its start isn't used. Of a GPU it is solved as by
@@ -101,6 +101,7 @@ class MPC:
         self.max_seconds = check_value(max_seconds, PositiveOrInfinite | None, "max_seconds")
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
+        self._spans_stages = self._free or self.period > self.dt  # whether a period may be longer than one
         self._previous = previous_of(problem)
         if self._previous and self.period < self.dt:
             asked, problem = (in_periods(one, self.period / self.dt) for one in (asked, problem))
@@ -226,7 +227,7 @@ class MPC:
         self._held, self._feasible, self._unlooked = ~solved, solved.copy(), solved.copy()
         if solved.all():
             self._begun, self._plan = np.full(len(solved), now), None
-            u = self._made(answer).mean(now, self.period) if self._free else answer.u
+            u = self._made(answer).mean(now, self.period) if self._spans_stages else answer.u
         else:
             with computing_on(CPU), torch.inference_mode(False):
                 u = self._hold(answer, solved, now, state, known)
@@ -266,7 +267,7 @@ class MPC:
             rows = torch.from_numpy(kept).nonzero().flatten()
             plan = plan.with_rows(rows, before.take(rows))
         self._plan = plan
-        return self._plan.mean(now, self.period, state) if self._free else self._plan.at(now, state).u
+        return self._plan.mean(now, self.period, state) if self._spans_stages else self._plan.at(now, state).u
 
     def _made(self, answer: Answer, now: float | None = None) -> Plan:
         """An answer's plans, from the times that they were made at, or all from now."""
@@ -327,7 +328,7 @@ class MPPIController:
 
     Attributes:
         numbers: what commands may change: names, shapes and values, also to be read and written by name.
-        U: the plan (B, N, m), of which the last command returned the first controls.
+        U: the plan (B, N, m), of which the last command returned the mean over the period: of its first stage at least.
 
     Raises:
         InputError: a problem with stages of several lengths or a free time; one of another device that can't be served
@@ -397,5 +398,9 @@ class MPPIController:
                 check_rows(now, open_loop(now, improved), improved)
             self.U = improved
         self._commands += 1
-        u = self.U[:, 0].clone().to(self._origin[0])
+        u = self.U[:, 0].clone()
+        if self.period is not None and self.period > self._dt:
+            knots = self._dt * np.arange(self.U.shape[1] + 1.0)[None]
+            u = mean_controls(self.U, knots, np.zeros((1, 1)), self.period)
+        u = u.to(self._origin[0])
         return u[0] if state.ndim == 1 and B == 1 else u

@@ -19,7 +19,9 @@ from torchgco.receding.plan import stages_between
 NEAR = 1e-3  # of the range of controls along the test's plans, that those in single precision may differ from Python's
 
 
-FIXED_NOTE = "- `stages` is by how many stages of {} s time has gone on since the last step; parts of one count, too."
+FIXED_NOTE = """\
+- `stages` is by how many stages of {} s time has gone on since the last step; parts of one count, too. Where a period
+  has several, u is the plan's mean over `w.period`, s: set it to yours."""
 FREE_NOTE = """\
 - The third argument is the time since the last step, s. `w.t` has the times of the plan's knots, s, and u is the plan's
   mean over `w.period`, s: set it to yours. The first step begins with a plan that was found when this was written."""
@@ -73,8 +75,13 @@ class Exported:
     @property
     def period(self) -> float:
         """By how much the horizon moves from step to step: stages, or seconds where the time is free."""
-        seconds = self.receding * (self.dt if self.seconds is None else self.seconds)
+        seconds = self.period_seconds
         return float(seconds if self.is_free else stages_between(seconds / self.dt))
+
+    @property
+    def period_seconds(self) -> float:
+        """The same, s."""
+        return float(self.receding * (self.dt if self.seconds is None else self.seconds))
 
     @property
     def words(self) -> dict[str, Any]:

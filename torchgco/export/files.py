@@ -40,13 +40,12 @@ TEMPLATES: dict[Build, dict[str, str]] = {
 # What headers say of both kinds of time, and of the number of elements.
 FIXED = {
     "DEFINED": "STAGES @PERIOD@ /* by which the horizon moves from step to step, unless `stages` says otherwise */",
-    "PERIOD_FIELD": "", "TIMES_FIELD": "", "MOVES": "stages",
+    "TIMES_FIELD": "", "MOVES": "stages",
     "MOVED_BY": "The plan before is moved on by so many stages", "GUESS_TIMES": "", "GUESS_NAMED": "",
     "AGE": "stages", "NO_PLAN": "and there is no plan.",
 }  # fmt: skip
 FREE = {
     "DEFINED": "PERIOD @PERIOD@ /* s: what `period` begins with */",
-    "PERIOD_FIELD": "    double period; /* s: u is the plan's mean over it; 0: that of its first stage */\n",
     "TIMES_FIELD": "    double t[@KNOTS@]; /* times of the plan's knots, s: t[NAME_N] is how long it lasts */\n",
     "MOVES": "elapsed", "MOVED_BY": "The plan before is moved on by the seconds that have `elapsed`",
     "GUESS_TIMES": ", const double *t", "GUESS_NAMED": " at the times t (N+1) of its knots, s", "AGE": "seconds",
@@ -151,9 +150,9 @@ def _code(exported: Exported) -> str:
         f"        shift(w->lam + {first}, b->constraints[{i}].place, N + 1, {p.row_shapes[i][1]}, by);"
         for i, first in firsts(solver.multipliers).items()
     ]
-    own = ["    w->element = element;"] * many + [f"    w->period = {exported.period!r};"] * exported.is_free
+    own = ["    w->element = element;"] * many + [f"    w->period = {exported.period_seconds!r};"]
     parts = {
-        "NO_MULTIPLIERS": none, "SHIFTS": "\n".join(shifts), "OWN": "\n".join(own),
+        "NO_MULTIPLIERS": none, "STAGE": f"{exported.dt!r}", "SHIFTS": "\n".join(shifts), "OWN": "\n".join(own),
         "OF_ELEMENT": ", int element" * many, "OF_TIMES": ", const double *t" * exported.is_free,
     }  # fmt: skip
     head = HEAD.format(version=VERSION)
@@ -171,7 +170,7 @@ def _readme(exported: Exported, words: dict[str, Any]) -> str:
     lam = sum(exported.solver.multipliers.values())
     count = sum(m.size for m in exported.changing.members) or 1
     count += sum(exported.sizes) + sum(exported.sizes_of_iterate) + lam
-    count += (exported.problem.N + 2) * exported.is_free  # times, and a period
+    count += 1 + (exported.problem.N + 1) * exported.is_free  # a period, and times
     workspace = exported.number * count + 8 * exported.solver.room + 64
     return _filled(
         "README.md", exported, **words, WORKSPACE=f"{workspace:,}", TABLES=f"{exported.solver.flash:,}",

@@ -95,7 +95,7 @@ class LoadedController:
         self._workspace = kinds()
         several = self.elements > 1
         self._functions["init"](ctypes.byref(self._workspace), *([ctypes.c_int(element)] if several else []))
-        if self._is_free:
+        if period is not None:
             self._workspace.period = self.period
         self._workspace.clock = self._clock = _CALLBACK(clock.seconds)
         self._numbers = _views(self._workspace, self._shapes)

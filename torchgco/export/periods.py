@@ -101,11 +101,11 @@ def _stepped(compiled: Compiled, exported: Exported, x: np.ndarray, elapsed: flo
 def _controls(compiled: Compiled, exported: Exported, answer: Answer) -> Tensor:
     """What C returns of an answer, (B, m)."""
     problem, u = compiled.problem, answer.u
-    if exported.is_free and exported.period > 0:
+    if exported.period_seconds > 0:
         start = answer.X.new_zeros(len(answer.X))
         dynamics, knots = problem.dynamics, answer.t
-        plan = Plan(X=answer.X, U=answer.U, K=answer.K, start=start, dt=dynamics.dt, dynamics=dynamics, knots=knots)
-        u = plan.mean(0.0, exported.period)
+        plan = Plan(X=answer.X, U=answer.U, K=answer.K, start=start, dt=exported.dt, dynamics=dynamics, knots=knots)
+        u = plan.mean(0.0, exported.period_seconds)
     if problem.control_bounds is not None:
         low, high = problem.control_bounds.over(problem.N)
         u = torch.minimum(torch.maximum(u, low[:, 0]), high[:, 0])

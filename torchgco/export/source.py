@@ -97,7 +97,7 @@ def solver_source(
     declared = "static int tgco_interior(const Interior *how, int64_t first, int64_t last);\n"
     declared += "static int64_t tgco_room(const Interior *how);\n"
     parts = {
-        "CONTACT": "contact.c", "FREE_TIME": "free_time.c" if begin.segments else None,
+        "CONTACT": "contact.c", "MEANS": "means.c", "FREE_TIME": "free_time.c" if begin.segments else None,
         "CARRIED": "carried.c" if carried.pointers else None,
     }  # fmt: skip
     text = (HERE / "controller.c").read_text()

@@ -113,17 +113,12 @@ class Plan:
     def mean(self, t: float, seconds: float, x: Any = None) -> Tensor:
         """The mean controls (B, m) from a time on, s, for so many seconds; x as in `at`.
 
-        Where the time is free, stages may be shorter than the period for which a vehicle holds its controls.
+        Stages may be shorter than the period for which a vehicle holds its controls.
         """
         with computing_on(CPU):
             knots = (self._from_start if self.knots is None else self.knots).numpy()
             since = t - self.start.numpy()[:, None]  # a loop's bits don't depend on when it began
-            last = np.maximum(knots[:, -1:], since + seconds)  # after the end the last control holds
-            knots = np.concatenate((np.minimum(knots[:, :1], since), knots[:, 1:-1], last), axis=1)
-            within = np.clip(knots, since, since + seconds)
-            shares = torch.from_numpy(np.diff(within, axis=1) / seconds)
-            # In the order of the stages, as exported C adds them: a product of matrices has another on each processor.
-            u = (shares.unsqueeze(-1) * self.U).cumsum(1)[:, -1]
+            u = mean_controls(self.U, knots, since, seconds)
             return self._at(t, None if x is None else self._states(x), u).u
 
     def _at(self, t: float, measured_x: Tensor | None, u: Tensor | None = None) -> Instant:
@@ -175,3 +170,15 @@ def stages_between(count: float) -> float:
     """A number of stages, whole where it is but for rounding."""
     whole = round(count)
     return whole if abs(count - whole) <= STAGE_ROUNDING * max(1.0, count) else count
+
+
+def mean_controls(U: Tensor, knots: np.ndarray, since: np.ndarray, seconds: float) -> Tensor:
+    """The means (B, m) of controls U (B, N, m) from times `since` (B|1, 1) on, s, for so many seconds.
+
+    Before the first of the knots' times (B|1, N+1) the first control holds, after the last one the last.
+    """
+    knots = np.repeat(knots, len(since) // len(knots), axis=0)
+    knots[:, 0], knots[:, -1] = np.minimum(knots[:, 0], since[:, 0]), np.maximum(knots[:, -1], since[:, 0] + seconds)
+    shares = torch.from_numpy(np.diff(np.clip(knots, since, since + seconds), axis=1) / seconds)
+    # In the order of the stages, as exported C adds them: a product of matrices has another on each processor.
+    return (shares.unsqueeze(-1) * U).cumsum(1)[:, -1]

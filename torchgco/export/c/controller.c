@@ -437,13 +437,10 @@ static int from_plan_before(NAME_workspace *w, Solve *b, const double *x, double
     return run(w, b, FROM_GUESS, until);
 }
 
+@MEANS@
 /* The controls for the next period of the plan that was found. */
 static void flown(const NAME_workspace *w, const Solve *b, double *u) {
-#if SEGMENTS
-    mean_controls(w->U, w->t, 0, w->period, u);
-#else
-    memcpy(u, w->U, NU * sizeof *u);
-#endif
+    mean_controls(w, 0, w->period, u);
     clamp(b, 0, USER_NU, u);
 }
 
@@ -455,19 +452,21 @@ static void hold(const NAME_workspace *w, const Solve *b, const double *x, doubl
     if (w->age >= 0) {
         double planned[USER_NX];
         planned_states(w, b, planned, &k);
-        mean_controls(w->U, w->t, w->age, w->period, u);
+        mean_controls(w, w->age, w->period, u);
         if (w->period <= 0) memcpy(u, w->U + k * USER_NU, USER_NU * sizeof *u);
         for (int j = 0; x && j < USER_NU; j++)
             for (int i = 0; i < USER_NX; i++) u[j] += w->K[(k * USER_NU + j) * USER_NX + i] * (x[i] - planned[i]);
     }
 #else
-    double age = rounded(w->age), share = age - (int)age;
+    double age = rounded(w->age), share = age - (int)age, means[USER_NU];
     int k = age < N - 1 ? (int)age : N - 1, later = k + 1 < N ? k + 1 : N - 1;
     int knot = age < N ? (int)age : N, next = knot + 1 < N + 1 ? knot + 1 : N;
+    int several = w->age >= 0 && w->period > knot_time(w, 1); /* stages are flown in a period */
+    if (several) mean_controls(w, age * knot_time(w, 1), w->period, means);
     for (int j = 0; j < NU; j++) {
         u[j] = b->rest[j];
         if (w->age < 0) continue;
-        u[j] = share > 0 ? w->U[later * NU + j] * share + (1 - share) * w->U[k * NU + j] : w->U[k * NU + j];
+        u[j] = several ? means[j] : share > 0 ? w->U[later * NU + j] * share + (1 - share) * w->U[k * NU + j] : w->U[k * NU + j];
         for (int i = 0; x && !RATED && i < USER_NX; i++) {
             double K = w->K[(k * NU + j) * USER_NX + i], X = w->X[knot * USER_NX + i];
             if (share > 0) {

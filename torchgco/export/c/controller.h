@@ -26,7 +26,8 @@ typedef struct {
     NAME_numbers numbers; /* to be written between steps */
     double (*clock)(void); /* the time, s, for `max_seconds`; 0: it has no effect */
     int max_iterations; /* of a step, in all; 0: @MAX_ITERATIONS@ for each of its solves */
-@ELEMENT_FIELD@@PERIOD_FIELD@
+@ELEMENT_FIELD@    double period; /* s: u is the plan's mean over it; 0, or up to a stage: that of its first stage */
+
     /* What the last step found. */
     int status; /* see above: how the last solve ended */
     int held; /* 1: u isn't of a plan that was found for now, but of the one before, with feedback, or at rest */

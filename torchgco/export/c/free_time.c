@@ -163,18 +163,6 @@ static void elapse(NAME_workspace *w, Solve *b, double seconds) {
     for (int i = 0; i < USER_CONSTRAINTS; i++) move_multipliers(&left, b, b->constraints + i);
 }
 
-/* The mean controls of a plan for so many seconds from `since` on; of none, those of the first stage. */
-static void mean_controls(const double *U, const double *t, double since, double seconds, double *u) {
-    for (int j = 0; j < USER_NU; j++) u[j] = seconds > 0 ? 0 : U[j];
-    for (int k = 0; k < N && seconds > 0; k++) {
-        double from = k ? t[k] : t[0] < since ? t[0] : since, end = since + seconds;
-        double to = k + 1 < N ? t[k + 1] : t[N] > end ? t[N] : end;
-        from = from < since ? since : from > end ? end : from;
-        to = to < since ? since : to > end ? end : to;
-        for (int j = 0; j < USER_NU; j++) u[j] += (to - from) / seconds * U[k * USER_NU + j];
-    }
-}
-
 /* The states of the plan that is flown at its age, after part of stage *k, which is given back. */
 static void planned_states(const NAME_workspace *w, const Solve *b, double *x, int *k) {
     const Problem *p = &b->problem;
