@@ -11,7 +11,7 @@ from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, ScaleWar
 from torchgco.base.status import Status
 from torchgco.judging.steps import Costates, step_errors
 from torchgco.judging.worst import NO_PLACE, SHARE, dwarfed, kind_of, noise
-from torchgco.kernels import costates
+from torchgco.kernels import costates, regulated
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
@@ -89,7 +89,7 @@ def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor, costate
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]
     times = None if solution.times is None else solution.times[rows]
-    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
+    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates, regulated)
     long = found.large.nonzero().flatten().tolist()
     if not long:
         return

@@ -42,6 +42,7 @@ LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 # whose shares add up to less than a 30th of what is large have at most a tenth of a large step cost.
 ELASTIC = 30.0
 Costates = Callable[[Problem, Tensor, Tensor, Sequence[Tensor]], Tensor | None]  # of problems, X, U and multipliers
+Regulated = Callable[[Problem, Tensor, Tensor, bool], tuple[Tensor, Tensor]]  # see `regulated`
 # Share of what is large below which costs of first order, and squares of the sum of all shares, say that both orders
 # are small: of these claims at most 0.45 of what is large.
 FAR = 0.2
@@ -88,6 +89,7 @@ def step_errors(
     multipliers: Sequence[Tensor] | None = None,
     doubted: bool = False,
     costates: Costates | None = None,
+    regulated: Regulated | None = None,
 ) -> StepErrors:
     """The errors of the steps along trajectories X (B, N+1, n), U (B, N, m), where each state follows from the last.
 
@@ -97,6 +99,7 @@ def step_errors(
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
             all stages together to be large, and of first order alone where that says enough (`FAR`).
         costates: finds them, or returns None where it can't. Where they are given, those of the end are its slopes.
+        regulated: by default that of NumPy.
     """
     lost = X.new_full((problem.B,), torch.nan)
     zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
@@ -123,7 +126,7 @@ def step_errors(
                 numbers = chosen + rows.start
                 lams = None if multipliers is None else tuple(lam[numbers] for lam in multipliers)
                 t = None if times is None else times[numbers]
-                part = _Differences(problem.take(numbers), X[numbers], U[numbers], e[chosen], t, lams)
+                part = _Differences(problem.take(numbers), X[numbers], U[numbers], e[chosen], t, lams, regulated)
                 if costates is not None:
                     part = replace(part, slopes=costates(part.problem, part.X, part.U, lams or ()))
                 costs[chosen] = part.cost(total[chosen], too_much[numbers] if doubted else None)
@@ -221,12 +224,13 @@ class _Differences:
     e: Tensor
     times: Tensor | None
     multipliers: tuple[Tensor, ...] | None  # None: controls don't answer
+    regulated: Regulated | None
     slopes: Tensor | None = None  # (B, N+1, n), of the cost by the states, where later states follow
 
     def take(self, rows: Tensor) -> _Differences:
         if (problem := self.problem.take(rows)) is self.problem:
             return self
-        tensors = self.X, self.U, self.e, self.times, self.multipliers, self.slopes
+        tensors = self.X, self.U, self.e, self.times, self.multipliers, self.regulated, self.slopes
         return _Differences(problem, *take(tensors, rows))
 
     def cost(self, shares: Tensor, too_much: Tensor | None) -> Tensor:
@@ -259,12 +263,12 @@ class _Differences:
             by_x[:, -1] = self.slopes[:, -1, :n]
         H[:, :, :n, n] = H[:, :, n, :n] = by_x
         H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
-        first, second = _answered(F, H, self.multipliers is not None)
+        first, second = (self.regulated or regulated)(problem, F, H, self.multipliers is not None)
         change = first.abs() + second.clamp(min=0.0) / (1.0 - 0.5 ** ORDER_OF[problem.dynamics.integrator])
         return _shares(change, size)
 
 
-def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
+def regulated(problem: Problem, F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
     """The change of J_var + lam'c by the differences, of first and of second order, (B,) each.
 
     Of z = [x, 1, share of the differences, u], the controls follow the states by the gains of the linear-quadratic

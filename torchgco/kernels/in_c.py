@@ -19,11 +19,11 @@ from torchgco.ilqr.step import Descent, keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
 from torchgco.kernels.outer import NativeOuter, blank_end, pass_end
 from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
+from torchgco.native import structures
 from torchgco.native.cuda.engine import current_device
 from torchgco.native.engine import OF_MODEL, OF_ROWS, WHOLE, Engine, Sampler, run
 from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_problem import KeptDescent
-from torchgco.native.structures import Options
 from torchgco.obstacles.base import TOUCH
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
@@ -156,6 +156,14 @@ class NativeKernels(Kernels):
         run(self.engine.library.tgco_costates, problem.B, self.engine.lanes, packed)
         return found
 
+    def regulated(self, F: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
+        """See `judging.steps.regulated`, of controls that answer."""
+        B, N = F.shape[:2]
+        first, second = F.new_empty(2, B)
+        packed = structures.Problem(N=N, slopes=F.contiguous(), curvatures=H.contiguous(), cost=first, merit=second)
+        run(self.engine.library.tgco_regulated, B, self.engine.lanes, packed)
+        return first, second
+
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
         B = lagrangian.problem.B
         for name in ITERATED:
@@ -210,7 +218,7 @@ class NativeKernels(Kernels):
         return self._samplers[how.dtype].improve(problem, U, how)
 
 
-def native_options(how: Descent) -> Options:
+def native_options(how: Descent) -> structures.Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
     return _options(
@@ -225,10 +233,10 @@ def native_options(how: Descent) -> Options:
 
 
 @lru_cache(maxsize=64)
-def _options(shrink: float, **numbers: Any) -> Options:
+def _options(shrink: float, **numbers: Any) -> structures.Options:
     """The structure with these fields: there are few of them, and filling one takes long beside a small solve."""
     rungs = rungs_of(shrink, numbers["smallest"], numbers["accept_last"])
-    return Options.complete(ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs), **numbers)
+    return structures.Options.complete(ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs), **numbers)
 
 
 def _flags(B: int) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.dynamics import rollout
+from torchgco.judging import steps
 from torchgco.kernels.choice import kernels_of, native
 from torchgco.kernels.in_pytorch import clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
@@ -78,6 +79,13 @@ def costates(problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> T
     if any(row.joins_knots for row in problem.constraints):
         return None
     return problem.known.in_c.costates(problem, X, U, lam)
+
+
+def regulated(problem: Problem, F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
+    """See `judging.steps.regulated`."""
+    if feedback and problem.known.in_c and native():
+        return problem.known.in_c.regulated(F, H)
+    return steps.regulated(problem, F, H, feedback)
 
 
 def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:
