@@ -101,40 +101,33 @@ def step_errors(
         costates: finds them, or returns None where it can't. Where they are given, those of the end are its slopes.
         regulated: by default that of NumPy.
     """
-    lost = X.new_full((problem.B,), torch.nan)
-    zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
-    none = torch.zeros_like(zeros, dtype=torch.bool)
-    error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), none, none.clone())
-    if not _halves(problem):
-        return error
-    order = ORDER_OF[problem.dynamics.integrator]
+    if problem.B == 0 or not _halves(problem):
+        zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
+        lost, none = X.new_full((problem.B,), torch.nan), torch.zeros_like(zeros, dtype=torch.bool)
+        return StepErrors(lost, lost.clone(), zeros, zeros.clone(), none, none.clone())
+    order, parts = ORDER_OF[problem.dynamics.integrator], list[tuple[Tensor, ...]]()
     too_much = X.new_full((problem.B,), (1.0 - 0.5**order) * LARGE_COST)
     if not is_users(problem.dynamics) and problem.time is None:
         too_much = torch.maximum(too_much, COARSE / problem.stages.to(X.dtype) ** order)
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
-            e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
+            lams = None if multipliers is None else tuple(lam[rows] for lam in multipliers)
+            own = problem.take(rows), X[rows], U[rows], None if times is None else times[rows]
+            e, share = _along(*own)
             worst, index = share.flatten(1).max(-1)
-            error.step_error[rows], error.stage[rows], error.state[rows] = worst, index // problem.n, index % problem.n
-            total = share.amax(-1).sum(-1)
-            asked = torch.isfinite(worst)
-            if doubted:
-                asked &= total > too_much[rows] / ELASTIC
-            costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
-            chosen = asked.nonzero().flatten()
+            total, limit = share.amax(-1).sum(-1), too_much[rows]
+            asked = total > limit / ELASTIC if doubted else torch.isfinite(worst)
+            costs = 0.0 * worst  # NaN where that isn't finite
+            chosen = (asked & torch.isfinite(worst)).nonzero().flatten()
             if chosen.numel() > 0:
-                numbers = chosen + rows.start
-                lams = None if multipliers is None else tuple(lam[numbers] for lam in multipliers)
-                t = None if times is None else times[numbers]
-                part = _Differences(problem.take(numbers), X[numbers], U[numbers], e[chosen], t, lams, regulated)
+                part = _Differences(*own[:3], e, own[3], lams, regulated).take(chosen)
                 if costates is not None:
-                    part = replace(part, slopes=costates(part.problem, part.X, part.U, lams or ()))
-                costs[chosen] = part.cost(total[chosen], too_much[numbers] if doubted else None)
-            error.step_cost[rows] = costs
-        large = error.step_error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR)
-        costs = error.step_cost > too_much
-        error.large[:], error.of_cost[:] = large | costs, costs & ~large & (order == 1)
-    return error
+                    part = replace(part, slopes=costates(part.problem, part.X, part.U, part.multipliers or ()))
+                costs[chosen] = part.cost(total[chosen], limit[chosen] if doubted else None)
+            parts.append((worst, costs, index % problem.n, index // problem.n))
+        error, cost, state, stage = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
+        large, costly = error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR), cost > too_much
+        return StepErrors(error, cost, state, stage, large | costly, costly & ~large & (order == 1))
 
 
 def differences(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> Tensor | None:
@@ -364,7 +357,7 @@ def _size(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     At least `LEAST_COST` of the cost of staying at the start: what vanishes there, as a fit's misfit, has no size.
     """
-    cost, least = problem.cost, LEAST_COST * problem.cost.total(*problem.at_rest).abs().nan_to_num(0.0, 0.0)
+    cost, least = problem.cost, LEAST_COST * problem.cost_at_rest.abs().nan_to_num(0.0, 0.0)
     k = torch.arange(U.shape[1], device=U.device)
     with cost.precision(X.dtype):
         size = cost.stage(X[:, :-1], U, k).abs().sum(-1) + cost.terminal(X[:, -1]).abs()

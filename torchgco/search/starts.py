@@ -86,6 +86,8 @@ class Starts(Row):
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem, rows = search.call.problem, self._rows(search)
+        if rows.numel() == 0:
+            return
         slots, held = search.solver.slots or problem.B * self.count, search.best.end.best.X.clone()
         for number in range(START_ROUNDS if Converge.worth(problem) else 0):
             rows = rows[self._missed(search)[rows]] if number > 0 else rows
