@@ -42,7 +42,9 @@ LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 # whose shares add up to less than a 30th of what is large have at most a tenth of a large step cost.
 ELASTIC = 30.0
 Costates = Callable[[Problem, Tensor, Tensor, Sequence[Tensor]], Tensor | None]  # of problems, X, U and multipliers
-Regulated = Callable[[Problem, Tensor, Tensor, bool], tuple[Tensor, Tensor]]  # see `regulated`
+Regulated = Callable[
+    [Problem, Tensor, Tensor, Sequence[Tensor], Tensor, Tensor], tuple[Tensor, Tensor]
+]  # the same, steps F and costates
 # Share of what is large below which costs of first order, and squares of the sum of all shares, say that both orders
 # are small: of these claims at most 0.45 of what is large.
 FAR = 0.2
@@ -99,7 +101,7 @@ def step_errors(
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
             all stages together to be large, and of first order alone where that says enough (`FAR`).
         costates: finds them, or returns None where it can't. Where they are given, those of the end are its slopes.
-        regulated: by default that of NumPy.
+        regulated: finds what `_answered` does, where there are costates and their multipliers.
     """
     if problem.B == 0 or not _halves(problem):
         zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
@@ -245,23 +247,25 @@ class _Differences:
         """`StepErrors.step_cost` (B,), of costs of this `_size` (B,)."""
         problem, n = self.problem, self.problem.n
         held, U = within_horizons(problem), at_rest_after(problem, self.U)
-        whole = at_times(held, self.X, U, self.times)
         try:
-            by_x, by_u = _slopes(held, self.X, U, self.times, self.multipliers or ())
             F = _half_steps(problem, self.X[:, :-1], U, self.e, self.times)
-            H = _curvatures(problem, *whole, self.multipliers)
+            if self.regulated is not None and self.slopes is not None and self.multipliers is not None:
+                first, second = self.regulated(problem, self.X, U, self.multipliers, F, self.slopes)
+            else:
+                by_x, by_u = _slopes(held, self.X, U, self.times, self.multipliers or ())
+                H = _curvatures(problem, *at_times(held, self.X, U, self.times), self.multipliers)
+                if self.slopes is not None:  # of a phase, which doesn't know what follows
+                    by_x[:, -1] = self.slopes[:, -1, :n]
+                H[:, :, :n, n] = H[:, :, n, :n] = by_x
+                H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
+                first, second = _answered(F, H, self.multipliers is not None)
         except RuntimeError:  # code that autograd can't differentiate twice, as that of samplers
             return torch.full_like(self.X[:, 0, 0], torch.nan)
-        if self.slopes is not None:  # of a phase, which doesn't know what follows
-            by_x[:, -1] = self.slopes[:, -1, :n]
-        H[:, :, :n, n] = H[:, :, n, :n] = by_x
-        H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
-        first, second = (self.regulated or regulated)(problem, F, H, self.multipliers is not None)
         change = first.abs() + second.clamp(min=0.0) / (1.0 - 0.5 ** ORDER_OF[problem.dynamics.integrator])
         return _shares(change, size)
 
 
-def regulated(problem: Problem, F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
+def _answered(F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
     """The change of J_var + lam'c by the differences, of first and of second order, (B,) each.
 
     Of z = [x, 1, share of the differences, u], the controls follow the states by the gains of the linear-quadratic

@@ -149,20 +149,27 @@ class NativeKernels(Kernels):
     def costates(self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> Tensor:
         """See `kernels.costates`."""
         found, none = torch.zeros_like(X), X.new_zeros(problem.B)
-        lagrangian = Lagrangian(problem, Multipliers(tuple(lam), none), None, True)
-        packed = self.engine.terms(
-            lagrangian, X=X.contiguous(), U=U.contiguous(), cost=none, merit=none, slopes=found, optimality=True
-        )
+        packed = self._of_multipliers(problem, X, U, lam, cost=none, merit=none, slopes=found, optimality=1)
         run(self.engine.library.tgco_costates, problem.B, self.engine.lanes, packed)
         return found
 
-    def regulated(self, F: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
-        """See `judging.steps.regulated`, of controls that answer."""
-        B, N = F.shape[:2]
-        first, second = F.new_empty(2, B)
-        packed = structures.Problem(N=N, slopes=F.contiguous(), curvatures=H.contiguous(), cost=first, merit=second)
-        run(self.engine.library.tgco_regulated, B, self.engine.lanes, packed)
+    def regulated(
+        self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor], F: Tensor, slopes: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """See `kernels.regulated`."""
+        first, second = X.new_zeros(2, problem.B)
+        packed = self._of_multipliers(
+            problem, X, U, lam, cost=first, merit=second, halves=F.contiguous(), slopes=slopes.contiguous(), optimality=2
+        )
+        run(self.engine.library.tgco_regulated, problem.B, self.engine.lanes, packed)
         return first, second
+
+    def _of_multipliers(
+        self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor], **values: Any
+    ) -> structures.Problem:
+        """A trajectory with multipliers and no penalty."""
+        lagrangian = Lagrangian(problem, Multipliers(tuple(lam), X.new_zeros(problem.B)), None, True)
+        return self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), **values)
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
         B = lagrangian.problem.B

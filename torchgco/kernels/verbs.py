@@ -10,7 +10,6 @@ from torch import Tensor
 from torchgco.constraints.bounds import Bounds
 from torchgco.costs.base import ShiftedCost
 from torchgco.dynamics import rollout
-from torchgco.judging import steps
 from torchgco.kernels.choice import kernels_of, native
 from torchgco.kernels.in_pytorch import clearance_of
 from torchgco.lagrangian.lagrangian import Lagrangian
@@ -81,11 +80,15 @@ def costates(problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> T
     return problem.known.in_c.costates(problem, X, U, lam)
 
 
-def regulated(problem: Problem, F: Tensor, H: Tensor, feedback: bool) -> tuple[Tensor, Tensor]:
-    """See `judging.steps.regulated`."""
-    if feedback and problem.known.in_c and native():
-        return problem.known.in_c.regulated(F, H)
-    return steps.regulated(problem, F, H, feedback)
+def regulated(
+    problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor], F: Tensor, slopes: Tensor
+) -> tuple[Tensor, Tensor]:
+    """By how much steps F (B, N, n+2, n+2+m) of [x, 1, t, u], as those of `judging.steps`, change J_var + lam'c, (B,).
+
+    To first and to second order, where controls answer by feedback; of problems that have `costates`, the `slopes`.
+    """
+    assert problem.known.in_c
+    return problem.known.in_c.regulated(problem, X, U, lam, F, slopes)
 
 
 def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:

@@ -90,17 +90,6 @@ int tgco_costates(const Problem *p, int64_t first, int64_t last) {
     return put_all(p, first, last, CALLED(enter), CALLED(put_costates));
 }
 
-/* By how much differences of steps change the cost, to first and to second order, into `cost` and `merit`: of z = [x, 1, t, u]
-   `slopes` are here steps (E, N, NX+2, S+2) that t times the differences lead elsewhere, `curvatures` those of the cost with
-   its slopes (E, N+1, S+2, S+2). Controls answer by the gains of the regulator; at stages that have none they stay. */
-static void load_block(const double *from, int rows, int marked, int lane, OUT block, OUT column) {
-    for (int i = 0; i < rows; i++) {
-        const double *row = from + (i < NX ? i : i + 2) * (S + 2);
-        LANE(column[i], lane) = row[marked];
-        for (int c = 0; c < S; c++) LANE(block[i * S + c], lane) = row[c < NX ? c : c + 2];
-    }
-}
-
 /* Gains G of the controls by the states, 0 where there is no regulator, and Y of P = H_xx - Y'Y. */
 TGCO_LARGE void regulator(IN H, OUT G, OUT Y) {
     V L[TRIANGLE(NU)], pivots[NU];
@@ -116,16 +105,30 @@ TGCO_LARGE void regulator(IN H, OUT G, OUT Y) {
     for (int i = 0; i < NU * NX; i++) { G[i] = tgco_if(definite, G[i]); Y[i] = tgco_if(definite, Y[i]); }
 }
 
-static void put_regulated(const Problem *p, int64_t e, int used) {
-    V P[NX * NX], F[NX * S], T[S], H[S * S], G[NU * NX], Y[NU * NX], away[NX], g[S], by_t[S], v[NX], r[NX];
+/* By how much differences of steps change J_var + lam'c, to first and to second order, into `cost` and `merit`. Of
+   [x, 1, t, u] `halves` are steps (E, N, NX+2, S+2) that t times the differences lead elsewhere. Controls answer by the gains
+   of the regulator; at stages that have none they stay. What follows the last knot says its slopes, those in `slopes`
+   (E, N+1, NX). */
+static void put_regulated(Lanes *s, int64_t e, int used) {
+    const Problem *p = s->of;
+    V P[NX * NX], F[NX * S], T[S], H[S * S], held[S * S], G[NU * NX], Y[NU * NX], away[NX], g[S], by_t[S], v[NX], r[NX];
     V first = SET(0.0), second = SET(0.0);
     for (int64_t k = p->N; k >= 0; k--) {
-        for (int l = 0; l < LANES; l++) {
-            int64_t element = l < used ? e + l : e;
-            load_block(p->curvatures + (element * (p->N + 1) + k) * (S + 2) * (S + 2), S, NX, l, H, g);
-            if (k < p->N) load_block(p->slopes + (element * p->N + k) * (NX + 2) * (S + 2), NX, NX + 1, l, F, away);
-        }
+        IN x = s->X + k * NX; IN u = k < p->N ? s->U + k * NU : 0;
+        memset(g, 0, sizeof g); memset(H, 0, sizeof H); memset(held, 0, sizeof held);
+        cost_expand(s, k, x, u, g, H);
+        knot_expand(s, k, x, u, g, held);
+        for (int i = NX; i < S; i++) for (int j = i; j < S; j++) H[i * S + j] += held[i * S + j];
         for (int c = 0; c < S; c++) by_t[c] = SET(0.0);
+        for (int i = 0; i < NX; i++) {
+            for (int l = 0; l < LANES; l++) {
+                int64_t knot = s->element[l] * (p->N + 1) + k;
+                const double *row = p->halves + ((knot - s->element[l]) * (NX + 2) + i) * (S + 2);
+                if (k == p->N) { LANE(g[i], l) = p->slopes[knot * NX + i]; continue; }
+                LANE(away[i], l) = row[NX + 1];
+                for (int c = 0; c < S; c++) LANE(F[i * S + c], l) = row[c < NX ? c : c + 2];
+            }
+        }
         for (int i = 0; k < p->N && i < NX; i++) {
             V push = r[i];
             for (int c = 0; c < S; c++) T[c] = SET(0.0);
@@ -157,8 +160,7 @@ static void put_regulated(const Problem *p, int64_t e, int used) {
     for (int l = 0; l < used; l++) { p->cost[e + l] = LANE(first, l); p->merit[e + l] = LANE(second, l); }
 }
 int tgco_regulated(const Problem *p, int64_t first, int64_t last) {
-    for (int64_t e = first; e < last; e += LANES) put_regulated(p, e, last - e < LANES ? (int)(last - e) : LANES);
-    return 1;
+    return put_all(p, first, last, CALLED(enter), CALLED(put_regulated));
 }
 
 /* What the states and controls of a solve stand for: the rollout U + K (x - X) from the first knot of X, in place, by
