@@ -76,11 +76,6 @@ class Fleet:
         return float(self.members[0].dynamics.dt)
 
     @property
-    def is_batch(self) -> bool:
-        """Whether vehicles are the problems of one batch."""
-        return isinstance(self.vehicles, Problem)
-
-    @property
     def states(self) -> int:
         """States of all vehicles together."""
         return sum(one.n for one in self.members)

@@ -50,12 +50,6 @@ class Plans:
                 part[rows] = new
         self.status[rows], self.iterations[rows] = other.status, other.iterations
 
-    def put_one(self, v: int, rows: Tensor, other: Plans) -> None:
-        """Those of one vehicle in other fleets in the place of some."""
-        for mine, theirs in ((self.X, other.X), (self.U, other.U), (self.K, other.K)):
-            mine[v][rows] = theirs[v]
-        self.status[rows, v] = other.status[:, v]
-
     def set(self, v: int, rows: Tensor, found: Solution, of: Tensor) -> None:
         """Vehicle v of some fleets: the trajectories at places `of` of a solution."""
         self.X[v][rows], self.U[v][rows], self.K[v][rows] = found.X[of], found.U[of], found.K[of]

@@ -42,9 +42,8 @@ LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 # whose shares add up to less than a 30th of what is large have at most a tenth of a large step cost.
 ELASTIC = 30.0
 Costates = Callable[[Problem, Tensor, Tensor, Sequence[Tensor]], Tensor | None]  # of problems, X, U and multipliers
-Regulated = Callable[
-    [Problem, Tensor, Tensor, Sequence[Tensor], Tensor, Tensor], tuple[Tensor, Tensor]
-]  # the same, steps F and costates
+Regulated = Callable[..., tuple[Tensor, Tensor]]  # of the same, steps F and costates
+Kernels = tuple[Costates | None, Regulated | None]
 # Share of what is large below which costs of first order, and squares of the sum of all shares, say that both orders
 # are small: of these claims at most 0.45 of what is large.
 FAR = 0.2
@@ -90,8 +89,7 @@ def step_errors(
     times: Tensor | None = None,
     multipliers: Sequence[Tensor] | None = None,
     doubted: bool = False,
-    costates: Costates | None = None,
-    regulated: Regulated | None = None,
+    kernels: Kernels = (None, None),
 ) -> StepErrors:
     """The errors of the steps along trajectories X (B, N+1, n), U (B, N, m), where each state follows from the last.
 
@@ -100,8 +98,8 @@ def step_errors(
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
             all stages together to be large, and of first order alone where that says enough (`FAR`).
-        costates: finds them, or returns None where it can't. Where they are given, those of the end are its slopes.
-        regulated: finds what `_answered` does, where there are costates and their multipliers.
+        kernels: what finds costates, or returns None where it can't; where they are given, those of the end are its
+            slopes; and what finds the changes of `_answered`, where there are costates.
     """
     if problem.B == 0 or not _halves(problem):
         zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
@@ -122,9 +120,9 @@ def step_errors(
             costs = 0.0 * worst  # NaN where that isn't finite
             chosen = (asked & torch.isfinite(worst)).nonzero().flatten()
             if chosen.numel() > 0:
-                part = _Differences(*own[:3], e, own[3], lams, regulated).take(chosen)
-                if costates is not None:
-                    part = replace(part, slopes=costates(part.problem, part.X, part.U, part.multipliers or ()))
+                part = _Differences(*own[:3], e, own[3], lams, kernels[1]).take(chosen)
+                if kernels[0] is not None:
+                    part = replace(part, slopes=kernels[0](part.problem, part.X, part.U, part.multipliers or ()))
                 costs[chosen] = part.cost(total[chosen], limit[chosen] if doubted else None)
             parts.append((worst, costs, index % problem.n, index // problem.n))
         error, cost, state, stage = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))

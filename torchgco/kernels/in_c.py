@@ -158,9 +158,8 @@ class NativeKernels(Kernels):
     ) -> tuple[Tensor, Tensor]:
         """See `kernels.regulated`."""
         first, second = X.new_zeros(2, problem.B)
-        packed = self._of_multipliers(
-            problem, X, U, lam, cost=first, merit=second, halves=F.contiguous(), slopes=slopes.contiguous(), optimality=2
-        )
+        own = {"halves": F.contiguous(), "slopes": slopes.contiguous()}
+        packed = self._of_multipliers(problem, X, U, lam, cost=first, merit=second, optimality=2, **own)
         run(self.engine.library.tgco_regulated, problem.B, self.engine.lanes, packed)
         return first, second
 

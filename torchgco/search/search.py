@@ -54,9 +54,7 @@ class Best:
         self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that one in contact has replaced
         self.others: dict[int, list[SolveEnd]] = {}  # solved along other ways, in contact between two knots
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
-        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced, as what follows
-        self._clearance: Tensor | None = None
-        self._sound: Tensor | None = None
+        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced, as `clearance` and `sound`
 
     def of(self, rows: Tensor) -> SolveEnd:
         """How the best attempts of problems `rows` (b,), ascending, have ended: to be read, not to be kept."""
@@ -70,24 +68,20 @@ class Best:
             self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
         return self._arrived[tolerances]
 
-    @property
+    @cached_property
     def clearance(self) -> Tensor:
         """`path_clearance` (B,) of the best trajectories."""
-        if self._clearance is None:
-            self._clearance = path_clearance(self.call.problem, self.end.best.X, self.end.best.U)
-        return self._clearance
+        return path_clearance(self.call.problem, self.end.best.X, self.end.best.U)
 
-    @property
+    @cached_property
     def sound(self) -> Tensor:
         """Whether they are feasible, between the knots too, (B,) bool."""
-        if self._sound is None:
-            limit = self.solver.violation_tolerance
-            self._sound = is_sound(self.call.problem, self.end.best, limit, self.clearance)
-        return self._sound
+        return is_sound(self.call.problem, self.end.best, self.solver.violation_tolerance, self.clearance)
 
     def _forget(self) -> None:
         self._arrived.clear()
-        self._clearance = self._sound = None
+        for name in ("clearance", "sound"):
+            vars(self).pop(name, None)
 
     def next_attempt(self) -> None:
         """Count attempts in the trace, also those that no problem of this batch needs."""
