@@ -353,7 +353,7 @@ def _start(warm: Solution | None, solver: Solver, U0: Tensor | None, problem: Pr
         return problem, problem.x0.new_zeros(0, problem.N, problem.m)
     whole = for_solvers(problem)
     solver.announce(whole)
-    return problem, _guess(problem, whole)
+    return problem, problem.derive("guess", partial(_guess, problem, whole)).clone()
 
 
 def _guess(problem: Problem, whole: Problem) -> Tensor:

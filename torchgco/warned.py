@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchgco.base.errors import NAMED, ContactWarning, HorizonWarning, ScaleWarning, StepWarning
 from torchgco.base.status import Status
-from torchgco.judging.steps import Costates, step_errors
+from torchgco.judging.steps import Kernels, step_errors
 from torchgco.judging.worst import NO_PLACE, SHARE, dwarfed, kind_of, noise
-from torchgco.kernels import costates
+from torchgco.kernels import costates, regulated
 from torchgco.lagrangian.quality import has_arrived, ranks_arrival
 from torchgco.problem.in_time import at_times
 from torchgco.problem.problem import Problem
@@ -22,11 +22,11 @@ from torchgco.solvers.ending import touches
 CLAIMS = (Status.CONVERGED, Status.FEASIBLE)  # that the constraints hold
 
 
-def warn_of(problem: Problem, solution: Solution, cold: bool, costates: Costates = costates) -> None:
+def warn_of(problem: Problem, solution: Solution, cold: bool, kernels: Kernels = (costates, regulated)) -> None:
     """The warnings about a solution, at the caller's caller; of a horizon where no earlier solution led to it.
 
     Args:
-        costates: as of `step_errors`.
+        kernels: as of `step_errors`.
     """
     claims = torch.stack([solution.status == status for status in CLAIMS]).any(0)
     if solution.account is not None:
@@ -34,7 +34,7 @@ def warn_of(problem: Problem, solution: Solution, cold: bool, costates: Costates
     if cold:
         _warn_of_horizon(problem, solution, claims)
     _warn_of_scale(problem, solution, claims)
-    _warn_of_steps(problem, solution, claims, costates)
+    _warn_of_steps(problem, solution, claims, kernels)
     _warn_of_contact(problem, solution)
 
 
@@ -82,14 +82,14 @@ def _warn_of_scale(problem: Problem, solution: Solution, claims: Tensor) -> None
         )
 
 
-def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor, costates: Costates) -> None:
+def _warn_of_steps(problem: Problem, solution: Solution, claims: Tensor, kernels: Kernels) -> None:
     """A StepWarning where a trajectory that counts as feasible takes steps that are too long for the model."""
     rows = claims.nonzero().flatten()
     if rows.numel() == 0:
         return
     part, X, U = problem.take(rows), solution.X[rows], solution.U[rows]
     times = None if solution.times is None else solution.times[rows]
-    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, costates)
+    found = step_errors(part, X, U, times, [lam[rows] for lam in solution.multipliers.lam], True, kernels)
     long = found.large.nonzero().flatten().tolist()
     if not long:
         return

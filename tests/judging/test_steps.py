@@ -31,7 +31,7 @@ from torchgco import (
 )
 from torchgco.dynamics.rollout import open_loop
 from torchgco.judging.steps import step_errors
-from torchgco.kernels import costates, current
+from torchgco.kernels import costates, current, regulated
 
 D, DT, N = torch.float64, 0.1, 40
 NAMES = ("place", "speed", "force")
@@ -460,7 +460,39 @@ def test_costates_in_c_say_what_steps_cost() -> None:
     problem = current(problem)
     found = torchgco.solve(problem, U0)
     assert any(bool(lam.any()) for lam in found.multipliers.lam)
-    both = [step_errors(problem, found.X, found.U, None, found.multipliers.lam, costates=by) for by in (costates, None)]
-    assert costates(problem, found.X, found.U, found.multipliers.lam) is not None
-    torch.testing.assert_close(both[0].step_cost, both[1].step_cost, rtol=1e-8, atol=1e-12)
-    assert bool((both[0].step_cost > 0).all())
+    lams = found.multipliers.lam
+    assert costates(problem, found.X, found.U, lams) is not None
+    plain = step_errors(problem, found.X, found.U, None, lams).step_cost
+    assert bool((plain > 0).all())
+    for kernels in ((costates, None), (costates, regulated)):
+        by = step_errors(problem, found.X, found.U, None, lams, kernels=kernels).step_cost
+        torch.testing.assert_close(by, plain, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("of", ["bounds", "functions", "concave"])
+def test_the_regulator_in_c_answers_as_that_in_numpy(of: str) -> None:
+    """Where control rows bind; where a constraint of states and controls is traced; where controls stay."""
+    plain = planar_batch(B=5, N=20)[0]
+    weights = torch.tensor([1.0, -1e3 if of == "concave" else 3.0, 0.5, 2.0, 0.1], dtype=D)
+    cost = FunctionCost(
+        lambda x, u, w: x.square().sum(-1) + w * u.square().sum(-1), lambda x: x.square().sum(-1), values={"w": weights}
+    )
+    rows = {
+        "bounds": [ControlBounds([-0.3] * plain.m, [0.3] * plain.m)], "concave": [],
+        "functions": [FunctionConstraint(lambda x, u: u[..., :1] + 0.1 * x[..., :1].square() - 0.2, of="xu")],
+    }  # fmt: skip
+    problem = current(Problem(plain.dynamics, cost, rows[of], plain.x0, 20))
+    U = torch.full((5, 20, plain.m), 0.3 - 1e-9, dtype=D)
+    X = torchgco.kernels.open_loop(problem, U)
+    lams = [torch.rand(5, *shape, dtype=D, generator=torch.Generator().manual_seed(1)) for shape in problem.row_shapes]
+    by_c, plainly = (
+        step_errors(problem, X, U, None, lams, kernels=(costates, by)).step_cost for by in (regulated, None)
+    )
+    torch.testing.assert_close(by_c, plainly, rtol=1e-8, atol=0.0)
+    assert bool((by_c > 0).all())
+    for b in range(5):  # no number depends on the others
+        one = problem.take([b])
+        alone = step_errors(
+            one, X[b : b + 1], U[b : b + 1], None, [lam[b : b + 1] for lam in lams], kernels=(costates, regulated)
+        )
+        assert torch.equal(alone.step_cost, by_c[b : b + 1])

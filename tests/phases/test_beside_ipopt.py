@@ -61,7 +61,7 @@ def test_steps_of_phases_are_judged_by_the_slopes_of_all() -> None:
     whole, found, part = solution.whole, solution.found, solution[1]
     slopes = lambda: costates(whole.problem, found.X, found.U, found.multipliers.lam)
     given = part.X, part.U, part.times, list(part.multipliers.lam)
-    mine = step_errors(whole.members[1], *given, costates=_costates(whole.members[1], whole.spans[1], slopes))
+    mine = step_errors(whole.members[1], *given, kernels=(_costates(whole.members[1], whole.spans[1], slopes), None))
     theirs = step_errors(whole.members[1], *given)
     assert float(theirs.step_cost) > 0.0
     torch.testing.assert_close(mine.step_cost, theirs.step_cost, rtol=1e-6, atol=0.0)

@@ -274,4 +274,4 @@ def test_what_is_not_finite_does_not_start() -> None:
     merit[4] = torch.nan
     clear = torch.tensor([True, False, True, True, True, False])
     want = [Status.RUNNING, *[Status.NON_FINITE] * 4, Status.INVALID_START]
-    assert start_status(problem, X, merit, clear).tolist() == want
+    assert start_status(X, merit, clear).tolist() == want

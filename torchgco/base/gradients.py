@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import is_dataclass
@@ -62,7 +62,7 @@ def is_recording() -> bool:
 
 def leaves(tree: Any) -> list[Any]:
     """All that nested sequences, mappings and dataclasses hold, but for these themselves."""
-    return [node for node in nodes(tree) if not _holds(type(node))]
+    return [node for node in nodes(tree) if _holds(type(node)) is None]
 
 
 def nodes(tree: Any) -> list[Any]:
@@ -71,20 +71,24 @@ def nodes(tree: Any) -> list[Any]:
     waiting, seen = [tree], set[int]()
     while waiting:
         node = waiting.pop()
-        if not _holds(type(node)):
+        held = _holds(type(node))
+        if held is None:
             flat.append(node)
         elif id(node) not in seen:  # parts may hold each other
             seen.add(id(node))
             flat.append(node)
-            held = node if isinstance(node, (Mapping, tuple, list)) else getattr(node, "__dict__", {})
-            waiting += held.values() if isinstance(held, Mapping) else held
+            waiting += held(node)
     return flat
 
 
 @lru_cache(maxsize=4096)
-def _holds(kind: type) -> bool:
-    """Whether objects of a type are sequences, mappings, or of a dataclass: each solve looks at some hundred."""
-    return issubclass(kind, (Mapping, tuple, list)) or is_dataclass(kind)
+def _holds(kind: type) -> Callable[[Any], Iterable[Any]] | None:
+    """What sequences, mappings and dataclasses of a type hold; None of others: each solve looks at some hundred."""
+    if issubclass(kind, Mapping):
+        return lambda mapping: mapping.values()
+    if issubclass(kind, (tuple, list)):
+        return iter
+    return (lambda part: getattr(part, "__dict__", {}).values()) if is_dataclass(kind) else None
 
 
 def asking(tree: Any) -> list[Tensor]:

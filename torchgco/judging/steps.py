@@ -42,6 +42,8 @@ LEAST_OF_ALL = 1e-9  # of the largest size of any state: no range counts as less
 # whose shares add up to less than a 30th of what is large have at most a tenth of a large step cost.
 ELASTIC = 30.0
 Costates = Callable[[Problem, Tensor, Tensor, Sequence[Tensor]], Tensor | None]  # of problems, X, U and multipliers
+Regulated = Callable[..., tuple[Tensor, Tensor]]  # of the same, steps F and costates
+Kernels = tuple[Costates | None, Regulated | None]
 # Share of what is large below which costs of first order, and squares of the sum of all shares, say that both orders
 # are small: of these claims at most 0.45 of what is large.
 FAR = 0.2
@@ -87,7 +89,7 @@ def step_errors(
     times: Tensor | None = None,
     multipliers: Sequence[Tensor] | None = None,
     doubted: bool = False,
-    costates: Costates | None = None,
+    kernels: Kernels = (None, None),
 ) -> StepErrors:
     """The errors of the steps along trajectories X (B, N+1, n), U (B, N, m), where each state follows from the last.
 
@@ -96,42 +98,36 @@ def step_errors(
         multipliers: of every constraint, (B, K, p); None: the cost alone counts.
         doubted: the step cost, which takes longer, is 0 where it would have to be over `ELASTIC` times the errors of
             all stages together to be large, and of first order alone where that says enough (`FAR`).
-        costates: finds them, or returns None where it can't. Where they are given, those of the end are its slopes.
+        kernels: what finds costates, or returns None where it can't; where they are given, those of the end are its
+            slopes; and what finds the changes of `_answered`, where there are costates.
     """
-    lost = X.new_full((problem.B,), torch.nan)
-    zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
-    none = torch.zeros_like(zeros, dtype=torch.bool)
-    error = StepErrors(lost, lost.clone(), zeros, zeros.clone(), none, none.clone())
-    if not _halves(problem):
-        return error
-    order = ORDER_OF[problem.dynamics.integrator]
+    if problem.B == 0 or not _halves(problem):
+        zeros = torch.zeros(problem.B, dtype=torch.int64, device=X.device)
+        lost, none = X.new_full((problem.B,), torch.nan), torch.zeros_like(zeros, dtype=torch.bool)
+        return StepErrors(lost, lost.clone(), zeros, zeros.clone(), none, none.clone())
+    order, parts = ORDER_OF[problem.dynamics.integrator], list[tuple[Tensor, ...]]()
     too_much = X.new_full((problem.B,), (1.0 - 0.5**order) * LARGE_COST)
     if not is_users(problem.dynamics) and problem.time is None:
         too_much = torch.maximum(too_much, COARSE / problem.stages.to(X.dtype) ** order)
     with computing_on(X.device), torch.no_grad():
         for rows in _in_parts(problem.B, problem.N * problem.n**2):
-            e, share = _along(problem.take(rows), X[rows], U[rows], None if times is None else times[rows])
+            lams = None if multipliers is None else tuple(lam[rows] for lam in multipliers)
+            own = problem.take(rows), X[rows], U[rows], None if times is None else times[rows]
+            e, share = _along(*own)
             worst, index = share.flatten(1).max(-1)
-            error.step_error[rows], error.stage[rows], error.state[rows] = worst, index // problem.n, index % problem.n
-            total = share.amax(-1).sum(-1)
-            asked = torch.isfinite(worst)
-            if doubted:
-                asked &= total > too_much[rows] / ELASTIC
-            costs = torch.where(torch.isfinite(worst), torch.zeros_like(worst), torch.nan)
-            chosen = asked.nonzero().flatten()
+            total, limit = share.amax(-1).sum(-1), too_much[rows]
+            asked = total > limit / ELASTIC if doubted else torch.isfinite(worst)
+            costs = 0.0 * worst  # NaN where that isn't finite
+            chosen = (asked & torch.isfinite(worst)).nonzero().flatten()
             if chosen.numel() > 0:
-                numbers = chosen + rows.start
-                lams = None if multipliers is None else tuple(lam[numbers] for lam in multipliers)
-                t = None if times is None else times[numbers]
-                part = _Differences(problem.take(numbers), X[numbers], U[numbers], e[chosen], t, lams)
-                if costates is not None:
-                    part = replace(part, slopes=costates(part.problem, part.X, part.U, lams or ()))
-                costs[chosen] = part.cost(total[chosen], too_much[numbers] if doubted else None)
-            error.step_cost[rows] = costs
-        large = error.step_error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR)
-        costs = error.step_cost > too_much
-        error.large[:], error.of_cost[:] = large | costs, costs & ~large & (order == 1)
-    return error
+                part = _Differences(*own[:3], e, own[3], lams, kernels[1]).take(chosen)
+                if kernels[0] is not None:
+                    part = replace(part, slopes=kernels[0](part.problem, part.X, part.U, part.multipliers or ()))
+                costs[chosen] = part.cost(total[chosen], limit[chosen] if doubted else None)
+            parts.append((worst, costs, index % problem.n, index // problem.n))
+        error, cost, state, stage = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
+        large, costly = error > (LARGE_OF_FIRST if order == 1 else LARGE_ERROR), cost > too_much
+        return StepErrors(error, cost, state, stage, large | costly, costly & ~large & (order == 1))
 
 
 def differences(problem: Problem, X: Tensor, U: Tensor, times: Tensor | None) -> Tensor | None:
@@ -221,12 +217,13 @@ class _Differences:
     e: Tensor
     times: Tensor | None
     multipliers: tuple[Tensor, ...] | None  # None: controls don't answer
+    regulated: Regulated | None
     slopes: Tensor | None = None  # (B, N+1, n), of the cost by the states, where later states follow
 
     def take(self, rows: Tensor) -> _Differences:
         if (problem := self.problem.take(rows)) is self.problem:
             return self
-        tensors = self.X, self.U, self.e, self.times, self.multipliers, self.slopes
+        tensors = self.X, self.U, self.e, self.times, self.multipliers, self.regulated, self.slopes
         return _Differences(problem, *take(tensors, rows))
 
     def cost(self, shares: Tensor, too_much: Tensor | None) -> Tensor:
@@ -248,18 +245,20 @@ class _Differences:
         """`StepErrors.step_cost` (B,), of costs of this `_size` (B,)."""
         problem, n = self.problem, self.problem.n
         held, U = within_horizons(problem), at_rest_after(problem, self.U)
-        whole = at_times(held, self.X, U, self.times)
         try:
-            by_x, by_u = _slopes(held, self.X, U, self.times, self.multipliers or ())
             F = _half_steps(problem, self.X[:, :-1], U, self.e, self.times)
-            H = _curvatures(problem, *whole, self.multipliers)
+            if self.regulated is not None and self.slopes is not None and self.multipliers is not None:
+                first, second = self.regulated(problem, self.X, U, self.multipliers, F, self.slopes)
+            else:
+                by_x, by_u = _slopes(held, self.X, U, self.times, self.multipliers or ())
+                H = _curvatures(problem, *at_times(held, self.X, U, self.times), self.multipliers)
+                if self.slopes is not None:  # of a phase, which doesn't know what follows
+                    by_x[:, -1] = self.slopes[:, -1, :n]
+                H[:, :, :n, n] = H[:, :, n, :n] = by_x
+                H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
+                first, second = _answered(F, H, self.multipliers is not None)
         except RuntimeError:  # code that autograd can't differentiate twice, as that of samplers
             return torch.full_like(self.X[:, 0, 0], torch.nan)
-        if self.slopes is not None:  # of a phase, which doesn't know what follows
-            by_x[:, -1] = self.slopes[:, -1, :n]
-        H[:, :, :n, n] = H[:, :, n, :n] = by_x
-        H[:, :-1, n + 2 :, n] = H[:, :-1, n, n + 2 :] = by_u
-        first, second = _answered(F, H, self.multipliers is not None)
         change = first.abs() + second.clamp(min=0.0) / (1.0 - 0.5 ** ORDER_OF[problem.dynamics.integrator])
         return _shares(change, size)
 
@@ -360,7 +359,7 @@ def _size(problem: Problem, X: Tensor, U: Tensor) -> Tensor:
 
     At least `LEAST_COST` of the cost of staying at the start: what vanishes there, as a fit's misfit, has no size.
     """
-    cost, least = problem.cost, LEAST_COST * problem.cost.total(*problem.at_rest).abs().nan_to_num(0.0, 0.0)
+    cost, least = problem.cost, LEAST_COST * problem.cost_at_rest.abs().nan_to_num(0.0, 0.0)
     k = torch.arange(U.shape[1], device=U.device)
     with cost.precision(X.dtype):
         size = cost.stage(X[:, :-1], U, k).abs().sum(-1) + cost.terminal(X[:, -1]).abs()

@@ -29,6 +29,7 @@ from torchgco.kernels.verbs import is_convex as is_convex
 from torchgco.kernels.verbs import measured as measured
 from torchgco.kernels.verbs import open_loop as open_loop
 from torchgco.kernels.verbs import path_clearance as path_clearance
+from torchgco.kernels.verbs import regulated as regulated
 from torchgco.kernels.verbs import reproducible as reproducible
 from torchgco.kernels.verbs import rolled_out as rolled_out
 from torchgco.kernels.verbs import value as value

@@ -19,11 +19,11 @@ from torchgco.ilqr.step import Descent, keep_lifted
 from torchgco.kernels.in_pytorch import Judged, Kernels, clearance_of
 from torchgco.kernels.outer import NativeOuter, blank_end, pass_end
 from torchgco.lagrangian.lagrangian import InnerState, Lagrangian, Multipliers, PassEnd, State
+from torchgco.native import structures
 from torchgco.native.cuda.engine import current_device
 from torchgco.native.engine import OF_MODEL, OF_ROWS, WHOLE, Engine, Sampler, run
 from torchgco.native.interior import InteriorEngine, InteriorKernels
 from torchgco.native.kept_problem import KeptDescent
-from torchgco.native.structures import Options
 from torchgco.obstacles.base import TOUCH
 from torchgco.obstacles.spheres import BoundSpheres
 from torchgco.problem.problem import Problem
@@ -149,12 +149,26 @@ class NativeKernels(Kernels):
     def costates(self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> Tensor:
         """See `kernels.costates`."""
         found, none = torch.zeros_like(X), X.new_zeros(problem.B)
-        lagrangian = Lagrangian(problem, Multipliers(tuple(lam), none), None, True)
-        packed = self.engine.terms(
-            lagrangian, X=X.contiguous(), U=U.contiguous(), cost=none, merit=none, slopes=found, optimality=True
-        )
+        packed = self._of_multipliers(problem, X, U, lam, cost=none, merit=none, slopes=found, optimality=1)
         run(self.engine.library.tgco_costates, problem.B, self.engine.lanes, packed)
         return found
+
+    def regulated(
+        self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor], F: Tensor, slopes: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """See `kernels.regulated`."""
+        first, second = X.new_zeros(2, problem.B)
+        own = {"halves": F.contiguous(), "slopes": slopes.contiguous()}
+        packed = self._of_multipliers(problem, X, U, lam, cost=first, merit=second, optimality=2, **own)
+        run(self.engine.library.tgco_regulated, problem.B, self.engine.lanes, packed)
+        return first, second
+
+    def _of_multipliers(
+        self, problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor], **values: Any
+    ) -> structures.Problem:
+        """A trajectory with multipliers and no penalty."""
+        lagrangian = Lagrangian(problem, Multipliers(tuple(lam), X.new_zeros(problem.B)), None, True)
+        return self.engine.terms(lagrangian, X=X.contiguous(), U=U.contiguous(), **values)
 
     def descend(self, lagrangian: Lagrangian, s: InnerState, how: Descent, limit: int, begins: bool = False) -> PassEnd:
         B = lagrangian.problem.B
@@ -210,7 +224,7 @@ class NativeKernels(Kernels):
         return self._samplers[how.dtype].improve(problem, U, how)
 
 
-def native_options(how: Descent) -> Options:
+def native_options(how: Descent) -> structures.Options:
     """The options in the structure that the library reads."""
     search, printed = how.line_search, how.as_printed
     return _options(
@@ -225,10 +239,10 @@ def native_options(how: Descent) -> Options:
 
 
 @lru_cache(maxsize=64)
-def _options(shrink: float, **numbers: Any) -> Options:
+def _options(shrink: float, **numbers: Any) -> structures.Options:
     """The structure with these fields: there are few of them, and filling one takes long beside a small solve."""
     rungs = rungs_of(shrink, numbers["smallest"], numbers["accept_last"])
-    return Options.complete(ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs), **numbers)
+    return structures.Options.complete(ladder=torch.tensor(rungs, dtype=torch.float64), rungs=len(rungs), **numbers)
 
 
 def _flags(B: int) -> Tensor:

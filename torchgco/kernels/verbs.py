@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -78,6 +79,15 @@ def costates(problem: Problem, X: Tensor, U: Tensor, lam: Sequence[Tensor]) -> T
     if any(row.joins_knots for row in problem.constraints):
         return None
     return problem.known.in_c.costates(problem, X, U, lam)
+
+
+def regulated(problem: Problem, X: Tensor, U: Tensor, *found: Any) -> tuple[Tensor, Tensor]:
+    """By how much steps F (B, N, n+2, n+2+m) of [x, 1, t, u], as those of `judging.steps`, change J_var + lam'c, (B,).
+
+    To first and to second order, where controls answer by feedback. Further arguments are multipliers, F and what
+    `costates` has found.
+    """
+    return problem.known.in_c.regulated(problem, X, U, *found)
 
 
 def measured(problem: Problem, X: Tensor, U: Tensor, obstacles: bool = False) -> Tensor:

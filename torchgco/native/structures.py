@@ -9,6 +9,7 @@ from torch import Tensor
 from torchgco.base.draws import MURMUR_1, MURMUR_2, WEYL
 from torchgco.base.roots import BY_ROUNDING, MOST_EVALUATIONS, SERVES_AGAIN
 from torchgco.base.status import STOPPED, Status
+from torchgco.judging.steps import LEAST_SLACK
 from torchgco.lagrangian.barrier import FILTERED, GOLDEN, LEAST_SIZE, LONGEST_FALL, NUDGE, ORDINARY, ROUNDINGS
 from torchgco.native.declarations import Header, Structure, defines, enumerations
 from torchgco.native.includes import C
@@ -37,7 +38,7 @@ CONSTANTS = {
     "ABSENT": ABSENT, "NOWHERE": NOWHERE, "PAIRS": FILTERED, "LONGEST_FALL": LONGEST_FALL, "PARTS": 3,
     "COST_ARRAYS": len(Quadratic),
     "NUDGE": NUDGE, "GOLDEN": GOLDEN, "ROUNDINGS": ROUNDINGS, "ORDINARY": ORDINARY, "LEAST_SIZE": LEAST_SIZE,
-    "STOPPED": STOPPED,
+    "STOPPED": STOPPED, "LEAST_SLACK": LEAST_SLACK,
     "NEWTON_MOST": MOST_EVALUATIONS, "NEWTON_SERVES_AGAIN": SERVES_AGAIN,
     "NEWTON_ROUNDED_DOUBLE": (2.0**-52) ** BY_ROUNDING, "NEWTON_ROUNDED_SINGLE": (2.0**-23) ** BY_ROUNDING,
     **{name: f"{value & 0xFFFFFFFF:#x}u" for name, value in (

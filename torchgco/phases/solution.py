@@ -336,7 +336,7 @@ def _judged(whole: Whole, problem: Problem, found: Solution, solver: Solver) -> 
     solution = PhasesSolution(whole, replace(found, status=status), solver)
     slopes = cache(lambda: costates(problem, found.X, found.U, found.multipliers.lam))
     for member, part, span in zip(whole.members, solution, whole.spans, strict=True):
-        warn_of(member, part, False, _costates(member, span, slopes))
+        warn_of(member, part, False, (_costates(member, span, slopes), None))
     return solution
 
 

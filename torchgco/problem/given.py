@@ -160,7 +160,7 @@ def facts_of(tree: Any) -> list[Hashable]:
             plain = type(leaf) in (Tensor, torch.nn.Parameter) and leaf.layout == torch.strided
             if plain and leaf.device.type == "cpu" and leaf.numel() > 0:
                 facts.append(_sum(leaf.detach()))
-        elif isinstance(leaf, (int, float, str, bytes, Number)) or leaf is None or type(leaf) in ALONE:
+        elif leaf is None or isinstance(leaf, (int, float, str, bytes, Number)) or type(leaf) in ALONE:
             facts.append(leaf)
         elif callable(leaf):
             facts.append(_Itself(leaf))

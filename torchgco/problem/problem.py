@@ -178,19 +178,23 @@ class Problem(Subset):
         return self.derive_rows("start_is_clear", find)
 
     @property
+    def cost_at_rest(self) -> Tensor:
+        """J_var (B,) of staying at the start."""
+        return self.derive_rows("cost at rest", lambda problem: problem.cost.total(*problem.at_rest))
+
+    @property
     def cost_scale(self) -> CostScale:
         """The unit of each problem's cost, above 0, and its constant; see `scale.cost_scale`."""
         return self.derive_rows("cost_scale", Problem._cost_scale)
 
     def _cost_scale(self) -> CostScale:
-        X, U = self.at_rest
         stages = None if self.horizon is None else self.stages
         if isinstance(self.cost, BoundQuadratic) and self.cost.kernel == "quadratic":
             curvatures = self.cost.control_curvatures.expand(self.B, self.N, self.m)
-            return cost_scale(self.cost.total(X, U), curvatures, None, stages, self.control_bounds)
+            return cost_scale(self.cost_at_rest, curvatures, None, stages, self.control_bounds)
         s = self.n + 1 + self.m
         H = self.x0.new_empty(self.B, self.N + 1, s, s)
-        self.cost.expand(X, U, H)
+        self.cost.expand(*self.at_rest, H)
         slopes, diagonal = H[..., self.n], H.diagonal(dim1=-2, dim2=-1)
         z = [i for i in range(s) if i != self.n]
         return self.scale_of(slopes[..., z], diagonal[..., z])
@@ -201,7 +205,7 @@ class Problem(Subset):
         These are gradients and the Hessians' diagonals, (B, N+1, n+m) both.
         """
         X, U = self.at_rest
-        total, goal = self.cost.total(X, U), None if self.goal is None else self.goal.position
+        total, goal = self.cost_at_rest, None if self.goal is None else self.goal.position
         steps = reach(self.dynamics, X, self.control_bounds)
         changes = changes_of(self.cost, X, U, total, goal, self.dynamics.position, steps)
         changes = torch.maximum(changes, savings(slopes, curvatures))

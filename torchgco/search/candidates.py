@@ -70,10 +70,6 @@ def _inner(tolerance: float, iterations: int) -> ILQR:
 
 
 @lru_cache(maxsize=64)
-def _refining(inner: ILQR, rounds: int) -> AugmentedLagrangian:
-    return AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=rounds)
-
-
 def unwatched(done: int, total: int) -> None:
     """Ignores the progress of candidates."""
 
@@ -188,7 +184,8 @@ class Candidates:
         multipliers, rows = Multipliers(lam, CANDIDATE_PENALTY * self.unit), sound.nonzero().flatten()
         if refine.top == 1 or rows.numel() == 0:
             return Refined(self, multipliers, everyone[:: self.count], torch.full_like(self.unit, torch.inf))
-        part, solver = self.of(rows), _refining(inner_solver(iterations, 0.1), refine.rounds)
+        part, inner = self.of(rows), inner_solver(iterations, 0.1)
+        solver = AugmentedLagrangian(inner, initial_penalty=1.0, max_outer_iterations=refine.rounds)
         watched = None if self.watch is unwatched else lambda now: self.watch(now.finished, now.total)
         call = Call.within(part, at_rest_after(part, self.U[rows]), take(multipliers, rows), watched)
         end, made = solver.improved(call)

@@ -28,7 +28,7 @@ from torchgco.search.table import Row
 from torchgco.solution import Solution
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.ending import DOUBTED, STATIONARY
-from torchgco.solvers.interior import InteriorPoint, guessed
+from torchgco.solvers.interior import InteriorPoint
 
 WORTH = 0.01  # share of the cost that a trajectory without violation may cost more than one with some
 
@@ -58,9 +58,8 @@ class Converge(Row):
             if find_compiler() is not None:
                 self._tighten(search)
         elif self.begins(problem) and not search.begun:
-            guess = guessed(search.call)
-            found = search.interior.solved(search.call, guess=guess, escapes=True)
-            search.begin(search.interior.no_worse(search.call, guess, found))
+            found = search.interior.solved(search.call, guess=search.guess, escapes=True)
+            search.begin(search.interior.no_worse(search.call, search.guess, found))
             self._from_rest(search)
             if (rows := _unsolved(search)).numel() > 0:
                 search.best.improve(rows, search.call.take(rows))
@@ -89,10 +88,10 @@ class Converge(Row):
             open_ &= ~is_over(status)
         if not bool(open_.any()):
             return
-        X, U = call.problem.at_rest
-        held = call.problem.cost.total(X, U)
+        held = call.problem.cost_at_rest
         rows = (open_ & torch.isfinite(held) & ~(best.cost <= held)).nonzero().flatten()
         if rows.numel() > 0:
+            X, U = call.problem.at_rest
             call = replace(call.take(rows), U0=U[rows], callback=None)
             keep_tight(search, rows, search.interior.solved(call, X[rows]))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -24,7 +24,7 @@ from torchgco.solution import SearchRecord, Standing
 from torchgco.solvers.augmented_lagrangian import AugmentedLagrangian
 from torchgco.solvers.contracts import Call, Callback, Guidance, Progress, RowEnd
 from torchgco.solvers.ending import Recorder, fails_between
-from torchgco.solvers.interior import InteriorPoint
+from torchgco.solvers.interior import InteriorPoint, guessed
 
 
 def is_sound(problem: Problem, one: Iterate, limit: float, clearance: Tensor | None = None) -> Tensor:
@@ -54,8 +54,7 @@ class Best:
         self.spare: dict[int, SolveEnd] = {}  # by problem: the best clear trajectory that one in contact has replaced
         self.others: dict[int, list[SolveEnd]] = {}  # solved along other ways, in contact between two knots
         self.finished = call.problem.B - int((first.status == STOPPED).sum())  # as reported last
-        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced, as what follows
-        self._clearance: Tensor | None = None
+        self._arrived: dict[float, Tensor] = {}  # until a trajectory is replaced, as `clearance` and `sound`
 
     def of(self, rows: Tensor) -> SolveEnd:
         """How the best attempts of problems `rows` (b,), ascending, have ended: to be read, not to be kept."""
@@ -69,16 +68,20 @@ class Best:
             self._arrived[tolerances] = fits & has_arrived(self.call.problem, best.X, tolerances)
         return self._arrived[tolerances]
 
-    @property
+    @cached_property
     def clearance(self) -> Tensor:
         """`path_clearance` (B,) of the best trajectories."""
-        if self._clearance is None:
-            self._clearance = path_clearance(self.call.problem, self.end.best.X, self.end.best.U)
-        return self._clearance
+        return path_clearance(self.call.problem, self.end.best.X, self.end.best.U)
+
+    @cached_property
+    def sound(self) -> Tensor:
+        """Whether they are feasible, between the knots too, (B,) bool."""
+        return is_sound(self.call.problem, self.end.best, self.solver.violation_tolerance, self.clearance)
 
     def _forget(self) -> None:
         self._arrived.clear()
-        self._clearance = None
+        for name in ("clearance", "sound"):
+            vars(self).pop(name, None)
 
     def next_attempt(self) -> None:
         """Count attempts in the trace, also those that no problem of this batch needs."""
@@ -228,6 +231,11 @@ class Search:
         # (B,): whether the vehicle has been steered along all paths, so that there is no use in tracking these.
         self.steered = torch.zeros_like(call.ids, dtype=torch.bool)
         self.rejected = torch.full_like(call.U0[:, 0, 0], torch.nan)  # (B,): mu of the proposals rejected so far
+
+    @cached_property
+    def guess(self) -> Iterate:
+        """The trajectories that the call's controls lead to."""
+        return guessed(self.call)
 
     def begin(self, first: SolveEnd) -> None:
         """Keep the first solve of every problem."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchgco.base.status import Status
 from torchgco.base.tree import put, take
-from torchgco.kernels import chord_clearance, measured, open_loop
+from torchgco.kernels import chord_clearance, measured
 from torchgco.lagrangian.lagrangian import Iterate, Multipliers, SolveEnd
 from torchgco.lagrangian.quality import has_arrived, leaves_goal, outside_goal
 from torchgco.problem.problem import Problem
@@ -193,20 +193,17 @@ def _better_guesses(search: Search) -> tuple[Tensor, Iterate]:
     more than the solver's tolerance, or by more than what a smaller violation is worth.
     """
     call, end, limit = search.call, search.best.end, search.solver.violation_tolerance
-    problem, best = call.problem, end.best
-    X, sound = open_loop(problem, call.U0), is_sound(problem, best, limit, search.best.clearance)
-    rows = ((~sound | ~_falls_short(problem, X, best.X)) & (end.status != Status.INVALID_START)).nonzero().flatten()
+    problem, best, guess, sound = call.problem, end.best, search.guess, search.best.sound
+    cheaper = guess.cost < best.cost - _worth(search, guess.violation, best.violation) * best.cost.abs()
+    better = ~sound | (~_falls_short(problem, guess.X, best.X) & (cheaper | _falls_short(problem, best.X, guess.X)))
+    better &= (guess.violation <= limit) & torch.isfinite(guess.cost) & (end.status != Status.INVALID_START)
+    rows = better.nonzero().flatten()
     if rows.numel() == 0:
         return rows, best
-    asked, X, U, old = problem.take(rows), X[rows], call.U0[rows], take(best, rows)
-    cost, violation = asked.cost.total(X, U), measured(asked, X, U)
-    cheaper = cost < old.cost - _worth(search, violation, old.violation) * old.cost.abs()
-    better = ~sound[rows] | _falls_short(asked, old.X, X) | cheaper
-    better = (better & (violation <= limit) & torch.isfinite(cost)).nonzero().flatten()
-    lam = tuple(torch.zeros_like(rows_of[better]) for rows_of in old.multipliers.lam)
-    guess = Iterate(X[better], U[better], Multipliers(lam, old.multipliers.mu[better]), cost[better], violation[better])
-    clear = is_sound(asked.take(better), guess, limit).nonzero().flatten()
-    return rows[better[clear]], take(guess, clear)
+    guess, old = take(guess, rows), take(best.multipliers, rows)
+    guess = replace(guess, multipliers=Multipliers(tuple(torch.zeros_like(lam) for lam in old.lam), old.mu))
+    clear = is_sound(problem.take(rows), guess, limit).nonzero().flatten()
+    return rows[clear], take(guess, clear)
 
 
 def _ways_to_rest(search: Search) -> tuple[Tensor, Iterate]:
@@ -216,13 +213,13 @@ def _ways_to_rest(search: Search) -> tuple[Tensor, Iterate]:
     """
     call, end, limit = search.call, search.best.end, search.solver.violation_tolerance
     problem, best = call.problem, end.best
-    rows = (~is_sound(problem, best, limit) & (end.status != Status.INVALID_START)).nonzero().flatten()
+    rows = (~search.best.sound & (end.status != Status.INVALID_START)).nonzero().flatten()
     if problem.dynamics.dt is None or call.late or (problem.goal is not None and problem.goal.required):
         rows = rows[:0]
     if rows.numel() > 0:
         rows = rows[torch.isfinite(problem.x0[rows]).all(-1)]
     if rows.numel() == 0:
-        return rows, take(best, rows)
+        return rows, best
     asked, old = problem.take(rows), take(best, rows)
     found = held(asked, None, 0.0)
     cost, violation = asked.cost.total(found.X, found.U), measured(asked, found.X, found.U)

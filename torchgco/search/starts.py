@@ -36,7 +36,6 @@ from torchgco.search.tube import pursue
 from torchgco.solvers.contracts import Call
 from torchgco.solvers.convexity import KNOTS, STREAM, controls_of, half_ranges
 from torchgco.solvers.ending import STATIONARY
-from torchgco.solvers.interior import InteriorPoint
 
 START_ROUNDS = 2  # one guess turns a car round between walls in 2 of 5 cases: all of 8 miss in 1.7 %, of 16 in 0.03 %
 
@@ -86,6 +85,8 @@ class Starts(Row):
     def run(self, search: Search) -> None:
         """Solve; see the class."""
         problem, rows = search.call.problem, self._rows(search)
+        if rows.numel() == 0:
+            return
         slots, held = search.solver.slots or problem.B * self.count, search.best.end.best.X.clone()
         for number in range(START_ROUNDS if Converge.worth(problem) else 0):
             rows = rows[self._missed(search)[rows]] if number > 0 else rows
@@ -271,10 +272,6 @@ FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by littl
 
 
 @lru_cache(maxsize=64)
-def _from_caught(solver: InteriorPoint) -> InteriorPoint:
-    return replace(solver, initial_barrier=FROM_CAUGHT)
-
-
 @dataclass(frozen=True)
 class Direct(Row):
     """Solves caught problems by the interior point too; the results are compared with the search's at its end.
@@ -326,7 +323,7 @@ class Direct(Row):
         if left.numel() > 0:
             start = take(search.caught.last, rows[left])
             call = replace(call.take(left), U0=start.U)
-            solver = _from_caught(solver)
+            solver = replace(solver, initial_barrier=FROM_CAUGHT)
             left = left[self._compared(search, rows[left], call, solver.solved(call, start.X), bound[left])]
         if left.numel() > 0:
             pursue(search, rows[left])

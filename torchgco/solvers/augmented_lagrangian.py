@@ -168,7 +168,7 @@ class OuterLoop:
             replaced=torch.zeros_like(none, dtype=torch.bool), last_cost=worst.clone(),
             best=copied(Iterate(X, U, multipliers, cost, worst)),
         )  # fmt: skip
-        status = start_status(problem, X, merit, problem.start_is_clear)
+        status = start_status(X, merit, problem.start_is_clear)
         if self.guide_first:
             well = (status == Status.RUNNING).nonzero().flatten()
             self._ask_guidance(problem, state, well, status)

@@ -30,7 +30,7 @@ FIRST, STRONGER, TRIES = 1e-9, 100.0, 10  # regularisation where the backward pa
 HIDES = 0.1
 
 
-def start_status(problem: Problem, X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
+def start_status(X: Tensor, merit: Tensor, start_is_clear: Tensor | None) -> Tensor:
     """The statuses (B,) of problems that can't start, with rollouts X (B, N+1, n); RUNNING for the others."""
     # NaN compares as clear of every obstacle, so finiteness decides first.
     finite = torch.maximum(X.flatten(1).abs().amax(-1), merit.abs()) < torch.inf  # which NaN isn't either

@@ -92,18 +92,14 @@ def descend(
     rows = torch.arange(problem.B, device=U.device)
     none = (torch.zeros_like(rows) for _ in range(3))
     if kernels.compiled and start_is_clear is None:
-        X, cost, merit = (
-            U.new_empty(problem.B, problem.N + 1, problem.n),
-            U.new_empty(problem.B),
-            U.new_empty(problem.B),
-        )
+        X, cost, merit = (U.new_empty(problem.B, *shape) for shape in ((problem.N + 1, problem.n), (), ()))
         X[:, 0] = problem.x0
         whole = InnerState(rows, X, U.clone(), cost, merit, torch.zeros_like(cost), *none)
         status = _status(kernels.descend(lagrangian, whole, inner.descent, inner.max_iterations, begins=True))
     else:
         X, cost, merit = kernels.begun(lagrangian, U)
         whole = InnerState(rows, X, U.clone(), cost, merit.clone(), torch.zeros_like(cost), *none)
-        status = start_status(problem, X, merit, start_is_clear)
+        status = start_status(X, merit, start_is_clear)
     running, going, limit = whole, status == Status.RUNNING, inner.max_iterations if late is None else 1
     while (stay := going.nonzero().flatten()).numel() > 0:
         if late is not None and late():

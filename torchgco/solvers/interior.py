@@ -234,7 +234,7 @@ class InteriorPoint(Solver, named="solver"):
         else:
             X = torch.cat((problem.start_in(X0[:, 0]).unsqueeze(1), X0[:, 1:]), dim=1)
         start = problem.x0.unsqueeze(1).expand_as(X)
-        status = start_status(problem, start, problem.x0[:, 0], problem.start_is_clear)
+        status = start_status(start, problem.x0[:, 0], problem.start_is_clear)
         X = torch.where(torch.isfinite(X).flatten(1).all(-1).view(-1, 1, 1), X, start)
         end = SolveEnd.blank(problem, call.U0)
         end.status[:] = status
@@ -292,27 +292,21 @@ class InteriorPoint(Solver, named="solver"):
     def no_worse(self, call: Call, guess: Iterate, end: SolveEnd) -> SolveEnd:
         """The same, but with the guess where a solve failed and its result is worse: less feasible, or costlier."""
         problem, best = call.problem, end.best
-        X, cost, worst = guess.X, guess.cost, guess.violation
+        if (rows := (~is_over(end.status)).nonzero().flatten()).numel() == 0:
+            return end
         lost = ~(torch.isfinite(best.cost) & torch.isfinite(best.violation))
         violated = beyond_rounding(problem.held_at(best.X[:, 0]), best.U, best.violation, ROUNDING)
-        worse = is_better(cost, worst, best.cost, violated, self.admitted(problem)) | lost
-        rows = (worse & ~is_over(end.status) & torch.isfinite(cost) & torch.isfinite(worst)).nonzero().flatten()
-        if rows.numel() > 0:
-            multipliers = take(best.multipliers, rows)
-            none = Multipliers(tuple(torch.zeros_like(lam) for lam in multipliers.lam), multipliers.mu)
-            put(best, rows, Iterate(X[rows], call.U0[rows], none, cost[rows], worst[rows]))
+        worse = is_better(guess.cost, guess.violation, best.cost, violated, self.admitted(problem)) | lost
+        rows = rows[(worse & torch.isfinite(guess.cost) & torch.isfinite(guess.violation))[rows]]
+        multipliers = take(best.multipliers, rows)
+        none = Multipliers(tuple(torch.zeros_like(lam) for lam in multipliers.lam), multipliers.mu)
+        put(best, rows, replace(take(guess, rows), multipliers=none))
         return end
 
     def _some(
-        self,
-        kernels: InteriorKernels,
-        call: Call,
-        X: Tensor,
-        rows: Tensor,
-        end: SolveEnd,
-        smoothing: float,
+        self, kernels: InteriorKernels, call: Call, X: Tensor, rows: Tensor, end: SolveEnd, smoothing: float,
         escapes: bool,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         """Solves problems, and puts how they ended into `end` at `rows`; whether their costs fall to second order."""
         problem, warm = call.problem, call.warm
         if warm is None:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgco.base.errors import TraceWarning
 from torchgco.base.status import STOPPED, Status, is_over
-from torchgco.base.tree import Rows, is_users, put, spread, take
+from torchgco.base.tree import is_users, put, spread, take
 from torchgco.constraints.base import Constraint
 from torchgco.dynamics.rollout import open_loop
 from torchgco.kernels import kernels_of, measured, reproducible
@@ -131,15 +131,12 @@ class Session:
         return Iterate(X, U, best.multipliers.scaled(self.unit), cost, worst)
 
     def _looked_at(self, best: Iterate, slots: int | None = None) -> Optimality:
-        B, cost = self.call.problem.B, best.cost if self._own_costs else None
+        B, whole, cost = self.call.problem.B, self._lagrangian(best), best.cost if self._own_costs else None
         if slots is None or slots >= B:
-            return optimality(self._lagrangian(best), best.X, best.U, cost)
-        parts = [self._optimality(best, slice(i, i + slots)) for i in range(0, B, slots)]
-        return Optimality(*(torch.cat(column) for column in zip(*parts, strict=True)))
-
-    def _optimality(self, best: Iterate, rows: Rows) -> Optimality:
-        cost = best.cost[rows] if self._own_costs else None
-        return optimality(self._lagrangian(best).take(rows), best.X[rows], best.U[rows], cost)
+            return optimality(whole, best.X, best.U, cost)
+        parts = [slice(i, i + slots) for i in range(0, B, slots)]
+        each = [optimality(whole.take(rows), *take((best.X, best.U, cost), rows)) for rows in parts]
+        return Optimality(*(torch.cat(column) for column in zip(*each, strict=True)))
 
     def _lagrangian(self, best: Iterate) -> Lagrangian:
         return Lagrangian(self.call.problem, best.multipliers, None, not self.as_printed)

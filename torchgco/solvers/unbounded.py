@@ -33,12 +33,13 @@ def beyond_rounding(problem: Problem, U: Tensor, violation: Tensor, share: float
     from what the row makes of other controls, each up to a thousandth larger or smaller: rows count that are violated
     by more than a share of it, and by more than the last digits of the controls.
     """
-    digits = LAST_DIGITS * torch.finfo(U.dtype).eps * U.abs().amax(dim=(1, 2), keepdim=True)
-    far_off = U.abs().flatten(1).amax(-1) >= FAR_CONTROLS
-    rows = (far_off & (violation > 0) & torch.isfinite(violation)).nonzero().flatten()
+    rows = ((violation > 0) & torch.isfinite(violation)).nonzero().flatten()
+    if rows.numel() > 0:
+        rows = rows[U[rows].abs().flatten(1).amax(-1) >= FAR_CONTROLS]
     if rows.numel() == 0:
         return violation
-    far, U, digits, counted = problem.take(rows), U[rows], digits[rows], torch.zeros_like(violation[rows])
+    far, U, counted = problem.take(rows), U[rows], torch.zeros_like(violation[rows])
+    digits = LAST_DIGITS * torch.finfo(U.dtype).eps * U.abs().amax(dim=(1, 2), keepdim=True)
     X = open_loop(far, U)
     others = [U * (1.0 + OTHERWISE * (2.0 * uniform(i, U.shape[1:], U) - 1.0)) for i in range(OTHERS)]
     paths = [open_loop(far, V) for V in others]

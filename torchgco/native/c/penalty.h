@@ -14,12 +14,17 @@ static inline V worth(const Lanes *s, int equality, V c, V lam) {
     return tgco_fused(half * tgco_if(NOT(idle), mu), c, lam) * c;
 }
 
-/* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature. */
+/* First and second derivative of `worth` by c; where `optimality` is set, of lam c with the penalty's curvature, or where it
+   is 2 with that of a barrier, lam / slack. */
 static inline V pull(const Lanes *s, int equality, V c, V lam, V *rho) {
     const Problem *p = s->of;
     V mu = s->mu;
     if (p->optimality) { /* rows that bind, as lagrangian.binding has it */
         I binds = lam != SET(0.0);
+        if (p->optimality == 2) {
+            *rho = tgco_if(binds, tgco_fabs(lam) / tgco_maximum(tgco_fabs(c), SET(LEAST_SLACK)));
+            return lam;
+        }
         if (!equality) binds &= lam > -c;
         *rho = tgco_if(binds, mu);
         return lam;

@@ -57,6 +57,7 @@ typedef struct {
     double *gains; /* (E, N, NU, NZ): what tgco_gains writes */
     double *slack, *violation; /* (E): the same; NULL: not asked for */
     double *slopes, *curvatures; /* (E, N+1, S), (E, N+1, S, S): what tgco_expand writes; (E, N+1, NX) of tgco_costates */
+    const double *halves; /* of tgco_regulated, which reads costates in `slopes` */
     double *mu;
     int64_t *inner, *iterations, *rung;
     int32_t *status, *converged, *refused, *lost, *sensitive; /* sensitive: of tgco_gains; NULL: not asked for */
@@ -66,7 +67,8 @@ typedef struct {
     const double *shared, *stage_shared, *last_shared;
     Array cost_data[COST_ARRAYS];
     const Constraint *constraint;
-    int32_t guide, phr, replicas, optimality, bounded; /* bounded: no stage's cost is below 0 */
+    int32_t guide, phr, replicas, bounded; /* bounded: no stage's cost is below 0 */
+    int32_t optimality; /* see `pull` */
     Array center, radius, weight;
     Options options;
     double gain; /* share of L_M by which tgco_lift must lower it */

@@ -1,5 +1,6 @@
 /* What returned trajectories are judged by: violations, clearance, gains and what a step could still save, costates, and the
    rollouts that solves stand for. Functions return 0 without memory. */
+#include "cholesky.h"
 #include "lifted.h"
 #include "sweep.h"
 
@@ -87,6 +88,79 @@ static void put_costates(Lanes *s, int64_t e, int used) {
 }
 int tgco_costates(const Problem *p, int64_t first, int64_t last) {
     return put_all(p, first, last, CALLED(enter), CALLED(put_costates));
+}
+
+/* Gains G of the controls by the states, 0 where there is no regulator, and Y of P = H_xx - Y'Y. */
+TGCO_LARGE void regulator(IN H, OUT G, OUT Y) {
+    V L[TRIANGLE(NU)], pivots[NU];
+    I definite = SET(0.0) == SET(0.0);
+    factor_controls(H, L, pivots);
+    for (int j = 0; j < NU; j++) {
+        definite &= pivots[j] > SET(0.0);
+        for (int i = 0; i < NX; i++) Y[j * NX + i] = H[i * S + NX + j];
+    }
+    solve_lower(L, Y, NX, NX);
+    for (int i = 0; i < NU * NX; i++) G[i] = -Y[i];
+    solve_upper(L, G, NX, NX);
+    for (int i = 0; i < NU * NX; i++) { G[i] = tgco_if(definite, G[i]); Y[i] = tgco_if(definite, Y[i]); }
+}
+
+/* By how much differences of steps change J_var + lam'c, to first and to second order, into `cost` and `merit`. Of
+   [x, 1, t, u] `halves` are steps (E, N, NX+2, S+2) that t times the differences lead elsewhere. Controls answer by the gains
+   of the regulator; at stages that have none they stay. What follows the last knot says its slopes, those in `slopes`
+   (E, N+1, NX). */
+static void put_regulated(Lanes *s, int64_t e, int used) {
+    const Problem *p = s->of;
+    V P[NX * NX], F[NX * S], T[S], H[S * S], held[S * S], G[NU * NX], Y[NU * NX], away[NX], g[S], by_t[S], v[NX], r[NX];
+    V first = SET(0.0), second = SET(0.0);
+    for (int64_t k = p->N; k >= 0; k--) {
+        IN x = s->X + k * NX; IN u = k < p->N ? s->U + k * NU : 0;
+        memset(g, 0, sizeof g); memset(H, 0, sizeof H); memset(held, 0, sizeof held);
+        cost_expand(s, k, x, u, g, H);
+        knot_expand(s, k, x, u, g, held);
+        for (int i = NX; i < S; i++) for (int j = i; j < S; j++) H[i * S + j] += held[i * S + j];
+        for (int c = 0; c < S; c++) by_t[c] = SET(0.0);
+        for (int i = 0; i < NX; i++) {
+            for (int l = 0; l < LANES; l++) {
+                int64_t knot = s->element[l] * (p->N + 1) + k;
+                const double *row = p->halves + ((knot - s->element[l]) * (NX + 2) + i) * (S + 2);
+                if (k == p->N) { LANE(g[i], l) = p->slopes[knot * NX + i]; continue; }
+                LANE(away[i], l) = row[NX + 1];
+                for (int c = 0; c < S; c++) LANE(F[i * S + c], l) = row[c < NX ? c : c + 2];
+            }
+        }
+        for (int i = 0; k < p->N && i < NX; i++) {
+            V push = r[i];
+            for (int c = 0; c < S; c++) T[c] = SET(0.0);
+            for (int a = 0; a < NX; a++) {
+                ADD(push, P[i * NX + a], away[a]);
+                for (int c = 0; c < S; c++) ADD(T[c], P[i * NX + a], F[a * S + c]);
+            }
+            ADD(first, v[i], away[i]);
+            ADD(second, SET(0.5) * (r[i] + push), away[i]);
+            for (int a = 0; a < S; a++) {
+                ADD(g[a], F[i * S + a], v[i]);
+                ADD(by_t[a], F[i * S + a], push);
+                for (int c = a; c < S; c++) ADD(H[a * S + c], F[i * S + a], T[c]);
+            }
+        }
+        for (int i = 0; i < NU * NX; i++) G[i] = Y[i] = SET(0.0);
+        if (k < p->N) regulator(H, G, Y);
+        for (int i = 0; i < NX; i++) {
+            v[i] = g[i];
+            r[i] = by_t[i];
+            for (int j = 0; j < NU; j++) { ADD(v[i], G[j * NX + i], g[NX + j]); ADD(r[i], G[j * NX + i], by_t[NX + j]); }
+            for (int a = i; a < NX; a++) {
+                P[i * NX + a] = H[i * S + a];
+                for (int j = 0; j < NU; j++) SUBTRACT(P[i * NX + a], Y[j * NX + i], Y[j * NX + a]);
+                P[a * NX + i] = P[i * NX + a];
+            }
+        }
+    }
+    for (int l = 0; l < used; l++) { p->cost[e + l] = LANE(first, l); p->merit[e + l] = LANE(second, l); }
+}
+int tgco_regulated(const Problem *p, int64_t first, int64_t last) {
+    return put_all(p, first, last, CALLED(enter), CALLED(put_regulated));
 }
 
 /* What the states and controls of a solve stand for: the rollout U + K (x - X) from the first knot of X, in place, by
