@@ -23,7 +23,7 @@ from torchgco.fleets.verdict import judge_fleet
 from torchgco.lagrangian.kkt import RightSides
 from torchgco.problem.known import Known
 from torchgco.roadmap.timed import PARTS, library_for
-from torchgco.sensitivity.points import rows_that_hold, solve_at
+from torchgco.sensitivity.points import rows_in_barrier, solve_at
 
 ONE = torch.tensor([0])
 
@@ -135,13 +135,13 @@ def test_responses_are_columns_of_the_inverse() -> None:
     problem = disc([[-2.0, 0.1], [-2.0, 0.4]], [[2.0, 0.1], [2.0, 0.1]], Spheres([[0.0, 0.0]], [0.5], 0.2), N=30)
     found = SOLVER.solve(problem, torch.zeros(2, 30, 2, dtype=D), X0=problem.at_rest[0])
     found = torchgco.solve(problem, U0=found.U)
-    holds, _ = rows_that_hold(problem, found)
-    assert bool(holds.any())
-    R = responses(problem, found, slice(0, 2))
+    holds, give, _ = rows_in_barrier(problem, found, 0.0)
+    assert bool((holds & (give < 1e-6)).any())
+    R, _ = responses(problem, found, torch.zeros(2, 31, 2, dtype=D), torch.zeros(2, dtype=D))
     a = torch.zeros(3, 2, 31, 6, dtype=D)
     for column, (k, axis) in enumerate(((1, 0), (14, 1), (30, 0))):
         a[column, :, k, axis] = -1.0
     gaps, rows = a.new_zeros(3, 2, 30, 4), a.new_zeros(3, *holds.shape)
-    z = solve_at(problem, found, holds, RightSides(a, gaps, rows)).z[:, :, 1:, :2].flatten(2)
+    z = solve_at(problem, found, holds, RightSides(a, gaps, rows), give).z[:, :, 1:, :2].flatten(2)
     for column, at in enumerate((0, 27, 58)):
         torch.testing.assert_close(R[:, :, at], z[column], rtol=1e-5, atol=1e-6 * float(R.abs().max()))

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
 from torchgco.fleets.among import SOLVER, Among
 from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.forces import balancing_forces, between_two, responses
+from torchgco.fleets.forces import balancing_forces, between_two, responses, stiffness
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords
 from torchgco.kernels import path_clearance
@@ -91,13 +91,17 @@ class Sides:
         push[:, rows.knots] = (2.0 * self.solution.multipliers.lam[self.place].unsqueeze(-1) * away).sum(2)
         return push
 
-    def responses(self, rows: Tensor, position: slice) -> Tensor:
-        """Of places at knots 1..N to forces there, (r, N d, N d), m per unit; NaN where the minimum isn't strict."""
+    def responses(self, rows: Tensor, forces: Tensor, kept: Tensor) -> Tensor:
+        """Of places at knots 1..N to more than the forces of others, (r, N d, N d), m per unit.
+
+        Args:
+            kept: the largest distance that each of these vehicles keeps, (r,), m.
+        """
         solution = self.solution.take(rows)
         lam = list(solution.multipliers.lam)
         del lam[self.place]
         own = replace(solution, multipliers=Multipliers(tuple(lam), solution.multipliers.mu))
-        return responses(self.bare.take(rows), own, position)
+        return responses(self.bare.take(rows), own, forces[rows], stiffness(own.cost, kept, self.bare.N))[0]
 
 
 class SharedRoom:
@@ -237,7 +241,8 @@ class SharedRoom:
             for place, v in enumerate(part.whose):
                 forces[:, v] = push[place * len(rows) + again]
             at = torch.cat([place * len(rows) + again for place in range(len(part.whose))])
-            found = part.responses(at, position)
+            kept = self.fleet.distances.amax(-1)[list(part.whose)].repeat_interleave(c)
+            found = part.responses(at, push, kept)
             for place, v in enumerate(part.whose):
                 answers[:, v] = found[place * c : (place + 1) * c]
         chosen = rows[again]
