@@ -16,7 +16,7 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets import solve
 from torchgco.fleets.among import BESIDE, SOLVER, Among
 from torchgco.fleets.forces import responses
-from torchgco.fleets.negotiated import TURNS, Negotiated
+from torchgco.fleets.negotiated import DEARER, DEAREST, Negotiated
 from torchgco.fleets.replanned import Replanned
 from torchgco.fleets.solve import alone
 from torchgco.fleets.verdict import judge_fleet
@@ -54,11 +54,13 @@ def test_ways_are_negotiated_until_nobody_meets_another_one() -> None:
         teams = Negotiated(fleet, forms_of(fleet), ONE, first, [order])
         assert bool(teams.meets.any()) and float(teams.cost[0]) == math.inf
         plans = teams.run()
-        assert not bool(teams.meets.any()) and teams.left[0] > 0
+        assert not bool(teams.meets.any())
         each = zip(fleet.members, plans.X, plans.U, strict=True)
         assert torch.equal(teams.cost, torch.stack([one.cost.total(x, u) for one, x, u in each]).sum(0))
         p = fleet.places(plans.X)[0]
         assert float((p[0] - p[1]).norm(dim=-1).min()) > 0.95 * 0.4
+        for one, x, u in zip(fleet.members, plans.X, plans.U, strict=True):
+            torch.testing.assert_close(open_loop(DISC, one.x0, u), x, rtol=0, atol=1e-5)
         best, forms = solve._Best(fleet, first, 0, ONE), forms_of(fleet)
         solve._improve(best, forms, ONE, plans, lambda: False)
         assert bool(best.verdict.reached[0])
@@ -69,7 +71,7 @@ def test_the_price_of_two_rises_while_they_meet() -> None:
     first = alone(fleet, torchgco.solve, 0, ONE, "gco")
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [[0, 1]])
     teams._go(0, 0, torchgco.roadmap.timed.TimedWays([], np.zeros(0), 1.0))  # finds no way
-    assert teams.dearer[0].tolist() == [[1.0, 4.0], [4.0, 1.0]] and teams.left == [2 * TURNS - 1]
+    assert teams.dearer[0].tolist() == [[1.0, DEARER], [DEARER, 1.0]]
 
 
 def test_negotiations_do_not_depend_on_other_fleets() -> None:
@@ -90,7 +92,7 @@ def test_a_negotiation_about_a_goal_inside_a_wall_ends() -> None:
     first = alone(fleet, torchgco.solve, 0, ONE, torchgco.InteriorPoint())
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]])
     plans = teams.run()
-    assert teams.left[0] >= 0 and all(bool(torch.isfinite(x).all()) for x in plans.X)
+    assert float(teams.dearer.max()) == DEAREST and all(bool(torch.isfinite(x).all()) for x in plans.X)
     late = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]], [[0]], lambda: True).run()
     assert all(torch.equal(mine, yours) for mine, yours in zip(late.U, first.U, strict=True))
 
@@ -102,7 +104,7 @@ def test_a_door_of_16_is_negotiated() -> None:
     order = np.random.default_rng(0).permutation(16).tolist()
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [order])
     teams.run()
-    assert not bool(teams.meets.any()), "not within 16 turns each"
+    assert not bool(teams.meets.any())
 
 
 def test_who_finds_no_plan_is_lost_and_others_do_not_plan_among_it() -> None:

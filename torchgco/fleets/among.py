@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,12 +44,12 @@ class Ground:
     Args:
         scene: without others.
         velocity: at the start, (d,), m/s.
-        most: that being anywhere for a layer, and any move, may cost.
+        wait: what waiting for a layer costs at most on the way without others.
     """
 
     scene: TimedScene
     velocity: Array
-    most: float
+    wait: float
 
     @classmethod
     def of(cls, problem: Problem, with_others: Problem, free: Tensor) -> Ground | None:
@@ -57,11 +58,8 @@ class Ground:
         if not can_search(with_others) or library_for(d) is None:
             return None
         scene = among(scene_in_time(with_others, free), problem)
-        most = 0.0
-        for cost in (scene.cell_cost, scene.move_cost):
-            some = cost[cost < FAR]
-            most += float(some.amax() - some.amin())
-        return cls(scene, Velocity.of(problem).start, most if most > 0.0 else 1.0)
+        wait = _wait(scene, free[:, problem.position], float(problem.dynamics.dt))
+        return cls(scene, Velocity.of(problem).start, wait)
 
     def among(self, others: Tensor, radii: Tensor, price: Tensor, dt: float) -> TimedScene:
         """The lattice among others at (M, N+1, d), dt apart, from which ways should keep `radii` (M,), m."""
@@ -71,6 +69,17 @@ class Ground:
         share = (k - before).clamp(max=1.0).view(1, -1, 1)
         center = torch.lerp(others[:, before], others[:, before + 1], share).transpose(0, 1)
         return replace(self.scene, others=Others(center, radii + BESIDE * lattice.spacing, price))
+
+
+def _wait(scene: TimedScene, p: Tensor, dt: float) -> float:
+    """What staying for a layer costs more than staying elsewhere, at most along places p (N+1, d), dt apart; where time
+    costs nothing, 1."""
+    lattice = scene.lattice
+    at = np.rint(lattice.tau / dt * np.arange(lattice.layers)).astype(np.int64).clip(0, len(p) - 1)
+    cells = torch.tensor([lattice.cell(point) for point in p.numpy()[at]])
+    costs = scene.cell_cost.gather(1, cells.unsqueeze(-1))[:, 0] - scene.cell_cost.amin(-1)
+    most = float(torch.where(costs < FAR, costs, 0.0).amax())
+    return most if most > 0.0 else 1.0
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ class _Turn:
             ground = self.among.ground(run.fleet, v, int(run.of[c]), run.plans.X[v][c])
             if ground is not None:
                 p, radii = self.p[i][:, there].transpose(0, 1), self.radii[i][there]
-                price = torch.full_like(radii, DEAREST * ground.most)
+                price = torch.full_like(radii, DEAREST * ground.wait)
                 scenes[i] = ground.among(p, radii, price, run.fleet.dt)
         searched = zip(scenes, timed_ways(list(scenes.values()), 1, 0.0), strict=True)
         found = {i: ways for i, ways in searched if ways.points}
