@@ -93,7 +93,7 @@ def test_a_negotiation_about_a_goal_inside_a_wall_ends() -> None:
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]])
     plans = teams.run()
     assert float(teams.dearer.max()) == DEAREST and all(bool(torch.isfinite(x).all()) for x in plans.X)
-    late = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]], [[0]], lambda: True).run()
+    late = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]], [[0]], late=lambda: True).run()
     assert all(torch.equal(mine, yours) for mine, yours in zip(late.U, first.U, strict=True))
 
 

@@ -1,7 +1,8 @@
-"""Vehicles of one form, each among motions of others that are known."""
+"""Vehicles of one form, each among motions of others that are known, and teams of such vehicles."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.plans import Plans
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
@@ -133,3 +135,30 @@ class Among:
     def place(self) -> int:
         """Which constraint of these problems are the others."""
         return sum(not part.is_goal for part in self.problem.constraints)
+
+
+@dataclass(eq=False)
+class Teams:
+    """C teams, whose vehicles plan side by side with those of others.
+
+    Args:
+        fleet: of which these are.
+        forms: of its vehicles.
+        of: which of the fleets each team is, (C,): several may be the same.
+        plans: what its vehicles begin with; their controls needn't lead to their states.
+        late: whether the time is over.
+    """
+
+    fleet: Fleet
+    forms: Sequence[Among]
+    of: Tensor
+    plans: Plans
+    late: Callable[[], bool] = field(default=lambda: False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self.plans = self.plans.take(torch.arange(len(self.of)))
+
+    def ground(self, c: int, v: int) -> Ground | None:
+        """The lattice of a vehicle of a team, without others."""
+        among = self.forms[self.fleet.form_of[v][0]]
+        return among.ground(self.fleet, v, int(self.of[c]), self.plans.X[v][c])

@@ -7,14 +7,12 @@ they should bring it, so there is always a solution, whatever the vehicles can d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchgco.fleets.among import SOLVER, Among
-from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.among import SOLVER, Teams
 from torchgco.fleets.forces import balancing_forces, between_two, responses, stiffness, under
 from torchgco.fleets.plans import Plans
 
@@ -26,27 +24,17 @@ CLOSE, NEARLY = 0.02, 0.25  # shares of what a pair keeps: with so little lackin
 NEAR = 1.0  # by how many times what they keep two may be farther apart whose forces are looked for
 
 
-class ComingApart:
-    """Rounds of C guesses side by side.
-
-    Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each of the C is, (C,).
-        plans: guesses, whose controls needn't lead to their states.
-        late: whether the time is over.
+@dataclass(eq=False)
+class ComingApart(Teams):
+    """Rounds of C teams side by side.
 
     Attributes:
         near: which of them are so far apart in the end that planes can do the rest, (C,) bool.
     """
 
-    near: Tensor
-
-    def __init__(
-        self, fleet: Fleet, forms: Sequence[Among], of: Tensor, plans: Plans, late: Callable[[], bool] = lambda: False
-    ) -> None:
-        self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
-        self.plans = plans.take(torch.arange(len(of)))
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fleet, of, plans = self.fleet, self.of, self.plans
         self.target = fleet.places(plans.X)
         self.force = torch.zeros_like(self.target)
         kept = fleet.distances.amax(-1)

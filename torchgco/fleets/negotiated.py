@@ -9,15 +9,15 @@ the end each follows its way as well as it can: what shares the room begins with
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import CONTACT_FACTOR
-from torchgco.fleets.among import SOLVER, Among, Ground
-from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.among import SOLVER, Teams
 from torchgco.fleets.forces import under
 from torchgco.fleets.plans import Plans
 from torchgco.obstacles.measured import segment_distance
@@ -28,37 +28,26 @@ DEARER = 4.0  # times, where two still meet: by orders of magnitude, as a long w
 DEAREST = 2.0**12  # times the first price, at most: half of the digits of single numbers are left to all other costs
 
 
-class Negotiated:
+@dataclass(eq=False)
+class Negotiated(Teams):
     """Negotiations of C teams side by side.
 
     Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each team is, (C,).
-        plans: what its vehicles do at first.
-        orders: of its vehicles, in which those that meet others have turns.
+        orders: of the vehicles of each team, in which those that meet others have turns.
         due: vehicles of each team that have a turn in any case, before all others.
-        late: whether the time is over.
     """
 
-    def __init__(
-        self,
-        fleet: Fleet,
-        forms: Sequence[Among],
-        of: Tensor,
-        plans: Plans,
-        orders: Sequence[Sequence[int]],
-        due: Sequence[Sequence[int]] | None = None,
-        late: Callable[[], bool] = lambda: False,
-    ) -> None:
-        C, V = len(of), fleet.V
-        self.fleet, self.forms, self.of, self.orders, self.late = fleet, forms, of, orders, late
-        self.due = [list(some) for some in due] if due is not None else [[] for _ in orders]
-        self.plans = plans.take(torch.arange(C))
-        self.p = fleet.places(plans.X)  # (C, V, N+1, d)
+    orders: Sequence[Sequence[int]]
+    due: Sequence[Sequence[int]] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        C, V = len(self.of), self.fleet.V
+        self.first = [list(vehicles) for vehicles in self.due or [[]] * C]
+        self.p = self.fleet.places(self.plans.X)  # (C, V, N+1, d)
         self.dearer = torch.ones(C, V, V, dtype=self.p.dtype)  # times the first price
         self.meets = torch.stack([torch.stack([self._met_by(c, v) for v in range(V)]) for c in range(C)])  # (C, V, V)
-        self.ways: list[list[TimedWays | None]] = [[None] * V for _ in orders]
+        self.ways: list[list[TimedWays | None]] = [[None] * V for _ in self.orders]
         self.next = [0] * C
 
     def run(self) -> Plans:
@@ -82,13 +71,13 @@ class Negotiated:
 
     def _whose_turn(self, c: int) -> int | None:
         """The next vehicle of a team that is due, or meets another one whose price can still rise; None: nobody."""
-        while self.due[c]:
-            if self._ground(c, v := self.due[c].pop(0)) is not None:
+        while self.first[c]:
+            if self.ground(c, v := self.first[c].pop(0)) is not None:
                 return v
         order, meets = self.orders[c], (self.meets[c] & (self.dearer[c] < DEAREST)).any(-1)
         for i in range(len(order)):
             at = (self.next[c] + i) % len(order)
-            if bool(meets[order[at]]) and self._ground(c, order[at]) is not None:
+            if bool(meets[order[at]]) and self.ground(c, order[at]) is not None:
                 self.next[c] = at + 1
                 return order[at]
         return None
@@ -99,13 +88,9 @@ class Negotiated:
         least = segment_distance(away[:, :-1], away[:, 1:]).amin(-1)
         return least < CONTACT_FACTOR * self.fleet.distances[v]
 
-    def _ground(self, c: int, v: int) -> Ground | None:
-        among = self.forms[self.fleet.form_of[v][0]]
-        return among.ground(self.fleet, v, int(self.of[c]), self.plans.X[v][c])
-
     def _scene(self, c: int, v: int) -> TimedScene:
         """The lattice of a vehicle among the present ways of the others."""
-        ground, keep = self._ground(c, v), self.fleet.distances[v]
+        ground, keep = self.ground(c, v), self.fleet.distances[v]
         assert ground is not None
         others = keep > 0
         price = ground.wait * self.dearer[c, v][others]
@@ -113,7 +98,7 @@ class Negotiated:
 
     def _go(self, c: int, v: int, ways: TimedWays) -> None:
         """Take a way; whom it meets pays more the next time."""
-        ground = self._ground(c, v)
+        ground = self.ground(c, v)
         assert ground is not None
         if ways.points:
             self.ways[c][v] = ways

@@ -14,15 +14,14 @@ Notes on decomposition methods, 2007).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
-from torchgco.fleets.among import SOLVER, Among
-from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.among import SOLVER, Teams
 from torchgco.fleets.forces import balancing_forces, between_two, responses, stiffness
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords
@@ -104,26 +103,17 @@ class Sides:
         return responses(self.bare.take(rows), own, forces[rows], stiffness(own.cost, kept, self.bare.N))[0]
 
 
-class SharedRoom:
-    """Rounds of C fleets side by side.
+@dataclass(eq=False)
+class SharedRoom(Teams):
+    """Rounds of C teams side by side."""
 
-    Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each of the C begins with, (C,): several may be guesses for the same.
-        plans: what they begin with.
-        late: whether the time is over.
-    """
-
-    def __init__(
-        self, fleet: Fleet, forms: Sequence[Among], of: Tensor, plans: Plans, late: Callable[[], bool] = lambda: False
-    ) -> None:
-        self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
-        self.now, self.best = plans.take(torch.arange(len(of))), plans.take(torch.arange(len(of)))
-        C, V, K, like = len(of), fleet.V, fleet.N + 1, fleet.distances
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.now, self.best = self.plans, self.plans.take(torch.arange(len(self.of)))
+        C, V, K, like = len(self.of), self.fleet.V, self.fleet.N + 1, self.fleet.distances
         self.needed = like.view(1, V, V, 1).repeat(C, 1, 1, K)
         self.grown = like.new_zeros(C, V)
-        self.step, self.shift = like.new_ones(C), torch.zeros_like(fleet.places(plans.X))
+        self.step, self.shift = like.new_ones(C), torch.zeros_like(self.fleet.places(self.plans.X))
         self.cost, self.least = like.new_full((C,), torch.inf), like.new_full((C,), torch.inf)
         self.sound = torch.zeros(C, dtype=torch.bool)
         self.live = torch.ones(C, dtype=torch.bool)
