@@ -46,7 +46,7 @@ class Ground:
     Args:
         scene: without others.
         velocity: at the start, (d,), m/s.
-        wait: what waiting for a layer costs at most on the way without others.
+        wait: what waiting for a layer costs in the mean on the way without others.
     """
 
     scene: TimedScene
@@ -74,14 +74,14 @@ class Ground:
 
 
 def _wait(scene: TimedScene, p: Tensor, dt: float) -> float:
-    """What staying for a layer costs more than staying elsewhere, at most along places p (N+1, d), dt apart; where time
-    costs nothing, 1."""
+    """What staying for a layer costs more than staying elsewhere, in the mean of places p (N+1, d), dt apart; 1 where
+    it costs nothing."""
     lattice = scene.lattice
     at = np.rint(lattice.tau / dt * np.arange(lattice.layers)).astype(np.int64).clip(0, len(p) - 1)
     cells = torch.tensor([lattice.cell(point) for point in p.numpy()[at]])
     costs = scene.cell_cost.gather(1, cells.unsqueeze(-1))[:, 0] - scene.cell_cost.amin(-1)
-    most = float(torch.where(costs < FAR, costs, 0.0).amax())
-    return most if most > 0.0 else 1.0
+    mean = float(torch.where(costs < FAR, costs, 0.0).mean())
+    return mean if mean > 0.0 else 1.0
 
 
 @dataclass(frozen=True)

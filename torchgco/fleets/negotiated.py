@@ -1,8 +1,8 @@
 """Ways through space and time that the vehicles of a fleet negotiate: whoever meets others goes where it costs least.
 
 Each in turn takes the cheapest way on its lattice, where meeting another one has a price: being all the way inside
-another one costs at first what waiting does where that is dearest, and more each time that the two still meet. So all
-vehicles give way by what it costs them, and no order decides beforehand who waits (compare L. McMurchie and C. Ebeling,
+another one costs at first what waiting does in the mean, and more each time that the two still meet. So all vehicles
+give way by what it costs them, and no order decides beforehand who waits (compare L. McMurchie and C. Ebeling,
 PathFinder: a negotiation-based performance-driven router, 1995). A lattice knows little of what vehicles can do, so in
 the end each follows its way as well as it can: what shares the room begins with trajectories.
 """
