@@ -25,7 +25,7 @@ from torchgco.roadmap.timed import TimedScene, TimedWays, timed_ways
 from torchgco.search.timed import guesses_along, smooth
 
 DEARER = 4.0  # times, where two still meet: by orders of magnitude, as a long wait may be for what takes an instant
-DEAREST = 2.0**12  # times the first price, at most: half of the digits of single numbers are left to all other costs
+DEAREST = 2.0**16  # times the first price, at most: beside it single numbers still tell a 256th of that one
 
 
 @dataclass(eq=False)
