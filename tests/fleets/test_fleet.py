@@ -107,7 +107,7 @@ def test_prioritised_planning_alone() -> None:
     second = torch.tensor([1])
     again = Replanned(fleet, forms_of(fleet), second, first.take(second), orders[1:], none[1:]).run()
     assert all(torch.equal(mine[0], yours[1]) for mine, yours in zip(again.U, plans.U, strict=True))
-    late = Replanned(fleet, forms_of(fleet), both, first, orders, none, lambda: True).run()
+    late = Replanned(fleet, forms_of(fleet), both, first, orders, none, late=lambda: True).run()
     assert all(torch.equal(mine, yours) for mine, yours in zip(late.U, first.U, strict=True))
 
 

@@ -16,14 +16,14 @@ from torchgco.dynamics.rollout import open_loop
 from torchgco.fleets import solve
 from torchgco.fleets.among import BESIDE, SOLVER, Among
 from torchgco.fleets.forces import responses
-from torchgco.fleets.negotiated import TURNS, Negotiated
+from torchgco.fleets.negotiated import DEARER, DEAREST, Negotiated
 from torchgco.fleets.replanned import Replanned
 from torchgco.fleets.solve import alone
 from torchgco.fleets.verdict import judge_fleet
 from torchgco.lagrangian.kkt import RightSides
 from torchgco.problem.known import Known
 from torchgco.roadmap.timed import PARTS, library_for
-from torchgco.sensitivity.points import rows_that_hold, solve_at
+from torchgco.sensitivity.points import rows_in_barrier, solve_at
 
 ONE = torch.tensor([0])
 
@@ -54,11 +54,13 @@ def test_ways_are_negotiated_until_nobody_meets_another_one() -> None:
         teams = Negotiated(fleet, forms_of(fleet), ONE, first, [order])
         assert bool(teams.meets.any()) and float(teams.cost[0]) == math.inf
         plans = teams.run()
-        assert not bool(teams.meets.any()) and teams.left[0] > 0
+        assert not bool(teams.meets.any())
         each = zip(fleet.members, plans.X, plans.U, strict=True)
         assert torch.equal(teams.cost, torch.stack([one.cost.total(x, u) for one, x, u in each]).sum(0))
         p = fleet.places(plans.X)[0]
         assert float((p[0] - p[1]).norm(dim=-1).min()) > 0.95 * 0.4
+        for one, x, u in zip(fleet.members, plans.X, plans.U, strict=True):
+            torch.testing.assert_close(open_loop(DISC, one.x0, u), x, rtol=0, atol=1e-5)
         best, forms = solve._Best(fleet, first, 0, ONE), forms_of(fleet)
         solve._improve(best, forms, ONE, plans, lambda: False)
         assert bool(best.verdict.reached[0])
@@ -69,7 +71,7 @@ def test_the_price_of_two_rises_while_they_meet() -> None:
     first = alone(fleet, torchgco.solve, 0, ONE, "gco")
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [[0, 1]])
     teams._go(0, 0, torchgco.roadmap.timed.TimedWays([], np.zeros(0), 1.0))  # finds no way
-    assert teams.dearer[0].tolist() == [[1.0, 4.0], [4.0, 1.0]] and teams.left == [2 * TURNS - 1]
+    assert teams.dearer[0].tolist() == [[1.0, DEARER], [DEARER, 1.0]]
 
 
 def test_negotiations_do_not_depend_on_other_fleets() -> None:
@@ -90,8 +92,8 @@ def test_a_negotiation_about_a_goal_inside_a_wall_ends() -> None:
     first = alone(fleet, torchgco.solve, 0, ONE, torchgco.InteriorPoint())
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]])
     plans = teams.run()
-    assert teams.left[0] >= 0 and all(bool(torch.isfinite(x).all()) for x in plans.X)
-    late = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]], [[0]], lambda: True).run()
+    assert float(teams.dearer.max()) == DEAREST and all(bool(torch.isfinite(x).all()) for x in plans.X)
+    late = Negotiated(fleet, forms_of(fleet), ONE, first, [[1, 0]], [[0]], late=lambda: True).run()
     assert all(torch.equal(mine, yours) for mine, yours in zip(late.U, first.U, strict=True))
 
 
@@ -102,7 +104,7 @@ def test_a_door_of_16_is_negotiated() -> None:
     order = np.random.default_rng(0).permutation(16).tolist()
     teams = Negotiated(fleet, forms_of(fleet), ONE, first, [order])
     teams.run()
-    assert not bool(teams.meets.any()), "not within 16 turns each"
+    assert not bool(teams.meets.any())
 
 
 def test_who_finds_no_plan_is_lost_and_others_do_not_plan_among_it() -> None:
@@ -135,13 +137,13 @@ def test_responses_are_columns_of_the_inverse() -> None:
     problem = disc([[-2.0, 0.1], [-2.0, 0.4]], [[2.0, 0.1], [2.0, 0.1]], Spheres([[0.0, 0.0]], [0.5], 0.2), N=30)
     found = SOLVER.solve(problem, torch.zeros(2, 30, 2, dtype=D), X0=problem.at_rest[0])
     found = torchgco.solve(problem, U0=found.U)
-    holds, _ = rows_that_hold(problem, found)
-    assert bool(holds.any())
-    R = responses(problem, found, slice(0, 2))
+    holds, give, _ = rows_in_barrier(problem, found, 0.0)
+    assert bool((holds & (give < 1e-6)).any())
+    R, _ = responses(problem, found, torch.zeros(2, 31, 2, dtype=D), torch.zeros(2, dtype=D))
     a = torch.zeros(3, 2, 31, 6, dtype=D)
     for column, (k, axis) in enumerate(((1, 0), (14, 1), (30, 0))):
         a[column, :, k, axis] = -1.0
     gaps, rows = a.new_zeros(3, 2, 30, 4), a.new_zeros(3, *holds.shape)
-    z = solve_at(problem, found, holds, RightSides(a, gaps, rows)).z[:, :, 1:, :2].flatten(2)
+    z = solve_at(problem, found, holds, RightSides(a, gaps, rows), give).z[:, :, 1:, :2].flatten(2)
     for column, at in enumerate((0, 27, 58)):
         torch.testing.assert_close(R[:, :, at], z[column], rtol=1e-5, atol=1e-6 * float(R.abs().max()))

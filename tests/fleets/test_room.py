@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
 import torchgco
-from tests.fleets.scenes import D, disc, swaps
-from torchgco import Fleet, QuadraticCost
+from benchmarks.families.fleet_scenes import quadrotors
+from tests.fleets.scenes import DISC, D, disc, swaps
+from torchgco import Fleet, FunctionDynamics, Problem, QuadraticCost
 from torchgco.fleets.among import SOLVER, Among
-from torchgco.fleets.coming_apart import ComingApart, Pulled
-from torchgco.fleets.forces import balanced, balancing_forces, between_two, responses
+from torchgco.fleets.coming_apart import ComingApart
+from torchgco.fleets.forces import Pulled, balanced, balancing_forces, between_two, responses, under
 from torchgco.fleets.guesses import SIDES, aside
 from torchgco.fleets.shared_room import SharedRoom
 from torchgco.fleets.solve import alone
@@ -66,24 +68,47 @@ def test_pulls_are_added_to_the_cost_and_compiled() -> None:
     assert isinstance(problem.cost, QuadraticCost) or found.account is not None
 
 
-def test_responses_are_how_far_a_force_moves_a_solution() -> None:
-    """Against solves under small forces."""
-    problem, none = disc([[0, 0]], [[2, 0.5]], N=20), torch.zeros(1, 21, 2, dtype=D)
-    form, still = Known(), torch.zeros(1, 1, dtype=D)
+def car(x: Tensor, u: Tensor) -> Tensor:
+    """Rates of x = [p, heading, speed]."""
+    heading, speed = x[..., 2:3], x[..., 3:]
+    return torch.cat((speed * heading.cos(), speed * heading.sin(), u), dim=-1)
 
-    def under(force: Tensor) -> Tensor:
-        pulled = problem._with({"cost": Pulled(problem.cost, force, still, slice(0, 2))}, known=form)
-        exact = torchgco.InteriorPoint(tolerance=1e-10)
-        return exact.solve(pulled, torch.zeros(1, 20, 2, dtype=D)).X[..., :2]
 
-    found = torchgco.InteriorPoint(tolerance=1e-10).solve(problem, torch.zeros(1, 20, 2, dtype=D))
-    R = responses(problem, found, slice(0, 2))[0]
+CAR = FunctionDynamics(car, 4, 2, 0.1, "rk4", position=slice(0, 2))
+
+
+@pytest.mark.parametrize("model", [DISC, CAR])
+def test_responses_are_how_far_a_force_moves_a_solution(model: FunctionDynamics) -> None:
+    """Against solves under small forces beside large ones, which add to the curvature where dynamics aren't linear."""
+    problem, exact = disc([[0, 0]], [[2, 0.5]], N=20, model=model), torchgco.InteriorPoint(tolerance=1e-10)
+    none, free = torch.zeros(1, dtype=D), torch.zeros(1, 21, 2, dtype=D)
+    large = free.clone()
+    large[0, 8:14, 1] = 1.0
+
+    def solved(force: Tensor) -> torchgco.Solution:
+        return exact.solve(under(problem, force, none, free), torch.zeros(1, 20, 2, dtype=D))
+
+    found = solved(large)
+    R, springs = responses(problem, found, large, none + 1.0)
+    R = R[0]
+    assert springs.tolist() == [0.0]
     torch.testing.assert_close(R, R.T, rtol=1e-5, atol=1e-7)
     for k, axis in ((5, 0), (12, 1), (20, 0)):
-        small = none.clone()
-        small[0, k, axis] = 1e-4
-        moved = (under(small) - under(none))[0, 1:].flatten() / 1e-4
+        small = large.clone()
+        small[0, k, axis] += 1e-4
+        moved = (solved(small).X - found.X)[0, 1:, :2].flatten() / 1e-4
         torch.testing.assert_close(moved, R[:, 2 * (k - 1) + axis], rtol=1e-2, atol=1e-4)
+
+
+def test_what_springs_have_held_responds_with_these() -> None:
+    """A force that grows faster with the distance than the cost holds has no minimum, but one beside springs."""
+    flat, one = QuadraticCost([0.0] * 4, [0.1, 0.1], [0.0] * 4), torch.ones(1, dtype=D)
+    free = torch.zeros(1, 21, 2, dtype=D)
+    problem = under(Problem(DISC, flat, [], torch.zeros(1, 4, dtype=D), 20), free, -40.0 * one, free)
+    for spring, strict in ((100.0, True), (1.0, False)):
+        found = SOLVER.solve(under(problem, free, 100.0 * one, free), torch.zeros(1, 20, 2, dtype=D))
+        R, springs = responses(problem, found, free, spring * one)
+        assert springs.tolist() == [spring] and bool(torch.isfinite(R).all()) == strict
 
 
 def test_two_that_meet_head_on_give_way_by_the_same() -> None:
@@ -92,7 +117,8 @@ def test_two_that_meet_head_on_give_way_by_the_same() -> None:
     first = alone(fleet, torchgco.solve, 0, torch.arange(1), "gco")
     p = fleet.places(first.X)
     normals, gaps = between_two(p)
-    R = torch.cat([responses(one, torchgco.solve(one), slice(0, 2)) for one in fleet.members])
+    none = torch.zeros(1, dtype=D)
+    R = torch.cat([responses(one, torchgco.solve(one), 0.0 * p[:, 0], none)[0] for one in fleet.members])
     needed = fleet.distances.unsqueeze(-1).expand(2, 2, 51)
     moved, forces = balancing_forces(normals[0], gaps[0], needed, torch.zeros_like(p[0]), R, 1.0)
     torch.testing.assert_close(moved[0], -moved[1], rtol=1e-4, atol=1e-6)
@@ -121,3 +147,15 @@ def test_vehicles_come_apart_and_share_the_room() -> None:
     guess = aside(one, known, zero, first.take(second), SIDES[0])
     again = SharedRoom(one, known, zero, ComingApart(one, known, zero, guess).run()).run()
     assert all(torch.equal(mine[0], yours[1]) for mine, yours in zip(again.U, shared.U, strict=True))
+
+
+@pytest.mark.slow
+def test_quadrotors_come_apart_though_their_dynamics_are_not_linear() -> None:
+    """Guesses for 16 of them leave pairs 0.25 m too close; forces between them make that up."""
+    fleet, one = quadrotors(16, 2, 1618).take([1]), torch.tensor([0])
+    first = alone(fleet, torchgco.solve, 0, one, "gco")
+    forms = [Among(problem, Known()) for problem, _ in fleet.forms]
+    apart = ComingApart(fleet, forms, one, aside(fleet, forms, one, first, SIDES[0]))
+    p = fleet.places(apart.run().X)
+    gaps = torch.stack([(p[:, i] - p[:, j]).norm(dim=-1).amin(-1) for i in range(16) for j in range(i)])
+    assert bool(apart.near.all()) and float(gaps.min()) > 0.98 * 0.8

@@ -1,13 +1,16 @@
-"""Vehicles of one form, each among motions of others that are known."""
+"""Vehicles of one form, each among motions of others that are known, and teams of such vehicles."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.plans import Plans
 from torchgco.obstacles.moved import Moved
 from torchgco.problem.known import Known
 from torchgco.problem.problem import Problem
@@ -43,12 +46,12 @@ class Ground:
     Args:
         scene: without others.
         velocity: at the start, (d,), m/s.
-        most: that being anywhere for a layer, and any move, may cost.
+        wait: what waiting for a layer costs in the mean on the way without others.
     """
 
     scene: TimedScene
     velocity: Array
-    most: float
+    wait: float
 
     @classmethod
     def of(cls, problem: Problem, with_others: Problem, free: Tensor) -> Ground | None:
@@ -57,11 +60,8 @@ class Ground:
         if not can_search(with_others) or library_for(d) is None:
             return None
         scene = among(scene_in_time(with_others, free), problem)
-        most = 0.0
-        for cost in (scene.cell_cost, scene.move_cost):
-            some = cost[cost < FAR]
-            most += float(some.amax() - some.amin())
-        return cls(scene, Velocity.of(problem).start, most if most > 0.0 else 1.0)
+        wait = _wait(scene, free[:, problem.position], float(problem.dynamics.dt))
+        return cls(scene, Velocity.of(problem).start, wait)
 
     def among(self, others: Tensor, radii: Tensor, price: Tensor, dt: float) -> TimedScene:
         """The lattice among others at (M, N+1, d), dt apart, from which ways should keep `radii` (M,), m."""
@@ -71,6 +71,17 @@ class Ground:
         share = (k - before).clamp(max=1.0).view(1, -1, 1)
         center = torch.lerp(others[:, before], others[:, before + 1], share).transpose(0, 1)
         return replace(self.scene, others=Others(center, radii + BESIDE * lattice.spacing, price))
+
+
+def _wait(scene: TimedScene, p: Tensor, dt: float) -> float:
+    """What staying for a layer costs more than staying elsewhere, in the mean of places p (N+1, d), dt apart; 1 where
+    it costs nothing."""
+    lattice = scene.lattice
+    at = np.rint(lattice.tau / dt * np.arange(lattice.layers)).astype(np.int64).clip(0, len(p) - 1)
+    cells = torch.tensor([lattice.cell(point) for point in p.numpy()[at]])
+    costs = scene.cell_cost.gather(1, cells.unsqueeze(-1))[:, 0] - scene.cell_cost.amin(-1)
+    mean = float(torch.where(costs < FAR, costs, 0.0).mean())
+    return mean if mean > 0.0 else 1.0
 
 
 @dataclass(frozen=True)
@@ -124,3 +135,30 @@ class Among:
     def place(self) -> int:
         """Which constraint of these problems are the others."""
         return sum(not part.is_goal for part in self.problem.constraints)
+
+
+@dataclass(eq=False)
+class Teams:
+    """C teams, whose vehicles plan side by side with those of others.
+
+    Args:
+        fleet: of which these are.
+        forms: of its vehicles.
+        of: which of the fleets each team is, (C,): several may be the same.
+        plans: what its vehicles begin with; their controls needn't lead to their states.
+        late: whether the time is over.
+    """
+
+    fleet: Fleet
+    forms: Sequence[Among]
+    of: Tensor
+    plans: Plans
+    late: Callable[[], bool] = field(default=lambda: False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self.plans = self.plans.take(torch.arange(len(self.of)))
+
+    def ground(self, c: int, v: int) -> Ground | None:
+        """The lattice of a vehicle of a team, without others."""
+        among = self.forms[self.fleet.form_of[v][0]]
+        return among.ground(self.fleet, v, int(self.of[c]), self.plans.X[v][c])

@@ -7,20 +7,14 @@ they should bring it, so there is always a solution, whatever the vehicles can d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from torchgco.base.tree import is_users
-from torchgco.costs.base import Cost
-from torchgco.fleets.among import SOLVER, Among
-from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.forces import balancing_forces, between_two, responses
+from torchgco.fleets.among import SOLVER, Teams
+from torchgco.fleets.forces import balancing_forces, between_two, responses, stiffness, under
 from torchgco.fleets.plans import Plans
-from torchgco.problem.known import Known
 
 ROUNDS = 24  # at most
 PATIENCE, LEFT = 7, 0.9  # rounds, after which no more than this share of what was lacking may be left
@@ -30,65 +24,23 @@ CLOSE, NEARLY = 0.02, 0.25  # shares of what a pair keeps: with so little lackin
 NEAR = 1.0  # by how many times what they keep two may be farther apart whose forces are looked for
 
 
-@dataclass(frozen=True)
-class Pulled(Cost):
-    """A cost with forces on the position, and springs: cost - force . p + weight / 2 |p - target|^2 at all knots."""
-
-    cost: Cost
-    pull: Tensor  # (B, N+1, d): force + weight target
-    weight: Tensor  # (B, 1)
-    position: slice
-
-    batched: ClassVar[tuple[str, ...]] = ("cost", "pull", "weight")
-    calls_function = property(lambda self: is_users(self.cost))
-
-    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
-        at = slice(k, k + 1) if isinstance(k, int) and x.dim() == 3 else k  # samples of one knot have an axis, too
-        pull = self.pull[:, at]
-        return self.cost.stage(x, u, k) + self._more(x, pull)
-
-    def terminal(self, x: Tensor) -> Tensor:
-        pull = self.pull[:, -1] if x.dim() == 2 else self.pull[:, -1:]
-        return self.cost.terminal(x) + self._more(x, pull)
-
-    def _more(self, x: Tensor, pull: Tensor) -> Tensor:
-        p = x[..., self.position]
-        weight = self.weight if x.dim() == 2 else self.weight.unsqueeze(1)
-        return ((0.5 * weight * p - pull) * p).sum(-1)
-
-    def rest_controls(self, like: Tensor) -> Tensor:
-        return self.cost.rest_controls(like)
-
-
-class ComingApart:
-    """Rounds of C guesses side by side.
-
-    Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each of the C is, (C,).
-        plans: guesses, whose controls needn't lead to their states.
-        late: whether the time is over.
+@dataclass(eq=False)
+class ComingApart(Teams):
+    """Rounds of C teams side by side.
 
     Attributes:
         near: which of them are so far apart in the end that planes can do the rest, (C,) bool.
     """
 
-    near: Tensor
-
-    def __init__(
-        self, fleet: Fleet, forms: Sequence[Among], of: Tensor, plans: Plans, late: Callable[[], bool] = lambda: False
-    ) -> None:
-        self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
-        self.plans = plans.take(torch.arange(len(of)))
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fleet, of, plans = self.fleet, self.of, self.plans
         self.target = fleet.places(plans.X)
         self.force = torch.zeros_like(self.target)
         kept = fleet.distances.amax(-1)
         each = zip(fleet.members, plans.X, plans.U, strict=True)
         cost = torch.stack([one.take(of).cost.total(x, u) for one, x, u in each], dim=1)
-        # Until the responses are known: what leads a vehicle all the way by what it keeps costs as much as its way.
-        self.weight = cost.abs() / (fleet.N * kept.square().clamp(min=1e-12))  # (C, V)
-        self.known = [Known() for _ in forms]
+        self.weight = stiffness(cost, kept, fleet.N)  # (C, V), until the responses are known
         self.live, self.near = torch.ones(len(of), dtype=torch.bool), torch.zeros(len(of), dtype=torch.bool)
         self.last: list[_Point | None] = [None] * len(of)
         self.history: list[list[float]] = [[] for _ in of]
@@ -104,7 +56,7 @@ class ComingApart:
         return self.plans
 
     def _round(self, rows: Tensor) -> None:
-        now, answers = self._solved(rows)
+        now, answers, springs = self._solved(rows)
         p = self.fleet.places(now.X)
         normals, gaps = between_two(p)
         needed = self.fleet.distances.unsqueeze(-1).expand(gaps.shape[1:])
@@ -121,8 +73,10 @@ class ComingApart:
                     self.live[c] = False
                     continue
                 moved, balance = balancing_forces(normals[i], gaps[i], needed, force[i], answers[i], NEAR)
+                balance = balance - springs[i][:, None, None] * moved  # the springs of these responses stay behind
                 last = self.last[c] = _Point(lacks, p[i], force[i], moved, balance)
-                self.weight[c] = 1.0 / answers[i].diagonal(dim1=-2, dim2=-1).mean(-1)
+                own = 1.0 / answers[i].diagonal(dim1=-2, dim2=-1).mean(-1)
+                self.weight[c] = torch.where((springs[i] > 0) | own.isnan(), self.weight[c], own)
             else:
                 self.radius[c] *= NARROWER
             past = self.history[c]
@@ -133,24 +87,25 @@ class ComingApart:
             self.target[c] = last.p + share * last.moved
             self.force[c] = last.force + share * (last.balance - last.force)
 
-    def _solved(self, rows: Tensor) -> tuple[Plans, Tensor]:
-        """What vehicles do under their forces, and responses (c, V, N d, N d)."""
+    def _solved(self, rows: Tensor) -> tuple[Plans, Tensor, Tensor]:
+        """What vehicles do under their forces, responses (c, V, N d, N d), and with which springs, (c, V)."""
         c, (V, K, d) = len(rows), self.target.shape[1:]
         now, answers = self.plans.take(rows), self.target.new_zeros(c, V, (K - 1) * d, (K - 1) * d)
-        for i, (form, (_, whose)) in enumerate(zip(self.forms, self.fleet.forms, strict=True)):
+        springs = self.target.new_zeros(c, V)
+        for form, (_, whose) in zip(self.forms, self.fleet.forms, strict=True):
             bare = form.problem.take(torch.cat([place * self.fleet.B + self.of[rows] for place in range(len(whose))]))
             of_each = self.weight, self.force, self.target
             weight, force, target = (torch.cat([part[rows, v] for v in whose]) for part in of_each)
-            cost = Pulled(bare.cost, force + weight.view(-1, 1, 1) * target, weight.unsqueeze(-1), bare.position)
             X, U = (torch.cat([part[v][rows] for v in whose]) for part in (self.plans.X, self.plans.U))
-            found = SOLVER.solve(bare._with({"cost": cost}, known=self.known[i]), U, X0=X)
-            answer = responses(bare, found, bare.position)
+            found = SOLVER.solve(under(bare, force, weight, target), U, X0=X)
+            push = force + weight.view(-1, 1, 1) * (target - found.X[..., bare.position])
+            answer, spring = responses(bare, found, push, weight)
             for place, v in enumerate(whose):
                 at = place * c + torch.arange(c)
                 now.set(v, torch.arange(c), found, at)
                 self.plans.iterations[rows, v] += found.iterations[at]
-                answers[:, v] = answer[at]
-        return now, answers
+                answers[:, v], springs[:, v] = answer[at], spring[at]
+        return now, answers, springs
 
 
 @dataclass

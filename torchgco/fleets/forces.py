@@ -7,12 +7,17 @@ programme: find l >= 0 with M l - q >= 0 and l'(M l - q) = 0, M the response of 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from torchgco.base.tree import is_users
+from torchgco.costs.base import Cost
 from torchgco.kernels import interior_of
 from torchgco.problem.problem import Problem
-from torchgco.sensitivity.points import gains_of, rows_that_hold
+from torchgco.sensitivity.points import gains_of, rows_in_barrier
 from torchgco.solution import Solution
 
 TINY = 1e-9  # m, below which two places are one
@@ -20,6 +25,36 @@ SOFT = 1e-6  # share of the responses by which pairs give way: rows that depend 
 STEPS = 40  # of the interior point on forces, at most
 ENOUGH = 1e-8  # product of force and gap at its end, as a share of the first one
 SHORT = 0.99  # share of the way to where a force or a gap would be 0
+
+
+@dataclass(frozen=True)
+class Pulled(Cost):
+    """A cost with forces on the position, and springs: cost - force . p + weight / 2 |p - target|^2 at all knots."""
+
+    cost: Cost
+    pull: Tensor  # (B, N+1, d): force + weight target
+    weight: Tensor  # (B, 1)
+    position: slice
+
+    batched: ClassVar[tuple[str, ...]] = ("cost", "pull", "weight")
+    calls_function = property(lambda self: is_users(self.cost))
+
+    def stage(self, x: Tensor, u: Tensor, k: int | Tensor) -> Tensor:
+        at = slice(k, k + 1) if isinstance(k, int) and x.dim() == 3 else k  # samples of one knot have an axis, too
+        pull = self.pull[:, at]
+        return self.cost.stage(x, u, k) + self._more(x, pull)
+
+    def terminal(self, x: Tensor) -> Tensor:
+        pull = self.pull[:, -1] if x.dim() == 2 else self.pull[:, -1:]
+        return self.cost.terminal(x) + self._more(x, pull)
+
+    def _more(self, x: Tensor, pull: Tensor) -> Tensor:
+        p = x[..., self.position]
+        weight = self.weight if x.dim() == 2 else self.weight.unsqueeze(1)
+        return ((0.5 * weight * p - pull) * p).sum(-1)
+
+    def rest_controls(self, like: Tensor) -> Tensor:
+        return self.cost.rest_controls(like)
 
 
 def balancing_forces(
@@ -124,9 +159,39 @@ def between_two(p: Tensor) -> tuple[Tensor, Tensor]:
     return normals, (normals * away).sum(-1)
 
 
-def responses(problem: Problem, solution: Solution, position: slice) -> Tensor:
-    """Of places at knots 1..N to forces there, (B, N d, N d), m per unit; NaN where the minimum isn't strict."""
-    holds, _ = rows_that_hold(problem, solution)
+def stiffness(cost: Tensor, kept: Tensor, N: int) -> Tensor:
+    """Of springs at N knots that, where they lead a vehicle away by the distance that it keeps, cost as much as its way
+    does."""
+    return cost.abs() / (N * kept.square().clamp(min=1e-12))
+
+
+def under(problem: Problem, forces: Tensor, springs: Tensor, target: Tensor) -> Problem:
+    """A problem with forces (B, N+1, d) on its position, and springs (B,) to a target (B, N+1, d)."""
+    pull = forces + springs.view(-1, 1, 1) * target
+    cost = Pulled(problem.cost, pull, springs.unsqueeze(-1), problem.position)
+    return problem._with({"cost": cost}, known=problem.known.of_lifted("pulled"))
+
+
+def responses(problem: Problem, solution: Solution, forces: Tensor, springs: Tensor) -> tuple[Tensor, Tensor]:
+    """Of places at knots 1..N to forces there, (B, N d, N d), m per unit, at minima of a problem under forces
+    (B, N+1, d) by the interior point, whose barrier stays.
+
+    Forces belong to it: where dynamics aren't linear, the costates that they change are part of the curvature. What
+    springs (B,) or walls have held may be no strict minimum without them. There springs to the present places stay;
+    which, (B,), is the second result. NaN where even these don't do.
+    """
+    found, strict = _responses(problem, solution, forces, torch.zeros_like(springs))
+    loose = (~strict).nonzero().flatten()
+    if len(loose):
+        parts = problem.take(loose), solution.take(loose), forces[loose], springs[loose]
+        found[loose], holds = _responses(*parts)
+        found[loose[~holds]] = torch.nan
+    return found, torch.where(strict, 0.0, springs)
+
+
+def _responses(problem: Problem, solution: Solution, forces: Tensor, springs: Tensor) -> tuple[Tensor, Tensor]:
+    """Responses with springs to the present places, and whether minima are strict, (B,)."""
+    held = under(problem, forces, springs, solution.X[..., problem.position])
+    active, give, _ = rows_in_barrier(held, solution, 0.0)
     point = solution.X, solution.U, solution.multipliers.lam
-    found, strict = interior_of(problem).responses(problem, *point, holds, gains_of(problem, solution), position)
-    return torch.where(strict.view(-1, 1, 1), found, torch.nan)
+    return interior_of(held).responses(held, *point, active, give, gains_of(held, solution), held.position)

@@ -1,68 +1,57 @@
 """Ways through space and time that the vehicles of a fleet negotiate: whoever meets others goes where it costs least.
 
-Each in turn takes the cheapest way on its lattice, where meeting another one has a price, and the price of two rises
-each time that they still meet. So all vehicles give way by what it costs them, and no order decides beforehand who
-waits (compare L. McMurchie and C. Ebeling, PathFinder: a negotiation-based performance-driven router, 1995). The ways
-are guesses: sharing the room makes trajectories of them.
+Each in turn takes the cheapest way on its lattice, where meeting another one has a price: being all the way inside
+another one costs at first what waiting does in the mean, and more each time that the two still meet. So all vehicles
+give way by what it costs them, and no order decides beforehand who waits (compare L. McMurchie and C. Ebeling,
+PathFinder: a negotiation-based performance-driven router, 1995). A lattice knows little of what vehicles can do, so in
+the end each follows its way as well as it can: what shares the room begins with trajectories.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import CONTACT_FACTOR
-from torchgco.fleets.among import Among, Ground
-from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.among import SOLVER, Teams
+from torchgco.fleets.forces import under
 from torchgco.fleets.plans import Plans
 from torchgco.obstacles.measured import segment_distance
 from torchgco.roadmap.timed import TimedScene, TimedWays, timed_ways
 from torchgco.search.timed import guesses_along, smooth
 
-FIRST_PRICE = 0.25  # of being all the way inside another one for a layer, as a share of the most that a layer costs
-DEARER = 4.0  # times, where two still meet after one of them has planned
-DEAREST = 1e4  # times the first price, at most: single numbers would lose all other costs
-TURNS = 16  # of each vehicle, at most
+DEARER = 4.0  # times, where two still meet: by orders of magnitude, as a long wait may be for what takes an instant
+DEAREST = 2.0**16  # times the first price, at most: beside it single numbers still tell a 256th of that one
 
 
-class Negotiated:
+@dataclass(eq=False)
+class Negotiated(Teams):
     """Negotiations of C teams side by side.
 
     Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each team is, (C,).
-        plans: what its vehicles do at first.
-        orders: of its vehicles, in which those that meet others have turns.
+        orders: of the vehicles of each team, in which those that meet others have turns.
         due: vehicles of each team that have a turn in any case, before all others.
-        late: whether the time is over.
     """
 
-    def __init__(
-        self,
-        fleet: Fleet,
-        forms: Sequence[Among],
-        of: Tensor,
-        plans: Plans,
-        orders: Sequence[Sequence[int]],
-        due: Sequence[Sequence[int]] | None = None,
-        late: Callable[[], bool] = lambda: False,
-    ) -> None:
-        C, V = len(of), fleet.V
-        self.fleet, self.forms, self.of, self.orders, self.late = fleet, forms, of, orders, late
-        self.due = [list(some) for some in due] if due is not None else [[] for _ in orders]
-        self.plans = plans.take(torch.arange(C))
-        self.p = fleet.places(plans.X)  # (C, V, N+1, d)
+    orders: Sequence[Sequence[int]]
+    due: Sequence[Sequence[int]] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        C, V = len(self.of), self.fleet.V
+        self.first = [list(vehicles) for vehicles in self.due or [[]] * C]
+        self.p = self.fleet.places(self.plans.X)  # (C, V, N+1, d)
         self.dearer = torch.ones(C, V, V, dtype=self.p.dtype)  # times the first price
         self.meets = torch.stack([torch.stack([self._met_by(c, v) for v in range(V)]) for c in range(C)])  # (C, V, V)
-        self.ways: list[list[TimedWays | None]] = [[None] * V for _ in orders]
-        self.next, self.left = [0] * C, [TURNS * V] * C
+        self.ways: list[list[TimedWays | None]] = [[None] * V for _ in self.orders]
+        self.next = [0] * C
 
     def run(self) -> Plans:
-        """Plans whose controls needn't lead to their states."""
+        """Trajectories along the ways."""
         while not self.late():
             turns = [(c, v) for c in range(len(self.of)) if (v := self._whose_turn(c)) is not None]
             if not turns:
@@ -81,14 +70,14 @@ class Negotiated:
         return torch.where(self.meets.flatten(1).any(-1), torch.inf, cost.nan_to_num(torch.inf))
 
     def _whose_turn(self, c: int) -> int | None:
-        """The next vehicle of a team that is due, or meets another one; None: nobody."""
-        while self.due[c]:
-            if self._ground(c, v := self.due[c].pop(0)) is not None:
+        """The next vehicle of a team that is due, or meets another one whose price can still rise; None: nobody."""
+        while self.first[c]:
+            if self.ground(c, v := self.first[c].pop(0)) is not None:
                 return v
-        order, meets = self.orders[c], self.meets[c].any(-1)
+        order, meets = self.orders[c], (self.meets[c] & (self.dearer[c] < DEAREST)).any(-1)
         for i in range(len(order)):
             at = (self.next[c] + i) % len(order)
-            if bool(meets[order[at]]) and self.left[c] > 0 and self._ground(c, order[at]) is not None:
+            if bool(meets[order[at]]) and self.ground(c, order[at]) is not None:
                 self.next[c] = at + 1
                 return order[at]
         return None
@@ -99,22 +88,17 @@ class Negotiated:
         least = segment_distance(away[:, :-1], away[:, 1:]).amin(-1)
         return least < CONTACT_FACTOR * self.fleet.distances[v]
 
-    def _ground(self, c: int, v: int) -> Ground | None:
-        among = self.forms[self.fleet.form_of[v][0]]
-        return among.ground(self.fleet, v, int(self.of[c]), self.plans.X[v][c])
-
     def _scene(self, c: int, v: int) -> TimedScene:
         """The lattice of a vehicle among the present ways of the others."""
-        ground, keep = self._ground(c, v), self.fleet.distances[v]
+        ground, keep = self.ground(c, v), self.fleet.distances[v]
         assert ground is not None
         others = keep > 0
-        price = FIRST_PRICE * ground.most * self.dearer[c, v][others]
+        price = ground.wait * self.dearer[c, v][others]
         return ground.among(self.p[c][others], keep[others], price, self.fleet.dt)
 
     def _go(self, c: int, v: int, ways: TimedWays) -> None:
         """Take a way; whom it meets pays more the next time."""
-        self.left[c] -= 1
-        ground = self._ground(c, v)
+        ground = self.ground(c, v)
         assert ground is not None
         if ways.points:
             self.ways[c][v] = ways
@@ -125,12 +109,22 @@ class Negotiated:
         self.dearer[c, meets, v] = self.dearer[c, v, meets]
 
     def _follow(self) -> None:
-        """States and controls along the ways."""
+        """Trajectories that follow the ways as well as the vehicles can.
+
+        Springs lead them there: being away at one knot by what a vehicle keeps costs as much as its way.
+        """
         for among, (_, whose) in zip(self.forms, self.fleet.forms, strict=True):
-            for place, v in enumerate(whose):
-                found = {c: ways for c, team in enumerate(self.ways) if (ways := team[v]) is not None}
-                if found:
-                    rows = list(found)
-                    problem = among.problem.take(place * self.fleet.B + self.of[rows])
-                    guesses = guesses_along(problem, torch.arange(len(rows)), list(found.values()))
-                    self.plans.X[v][rows], self.plans.U[v][rows] = guesses
+            along = {(c, v): ways for v in whose for c, team in enumerate(self.ways) if (ways := team[v]) is not None}
+            if not along:
+                continue
+            rows = torch.tensor([self.fleet.row_of(v, int(self.of[c])) for c, v in along])
+            problem = among.problem.take(rows)
+            X, U = guesses_along(problem, torch.arange(len(rows)), list(along.values()))
+            p, kept = X[..., problem.position], self.fleet.distances.amax(-1)[[v for _, v in along]]
+            springs = problem.cost.total(X, U).abs() / kept.square()
+            end = SOLVER.solve(under(problem, torch.zeros_like(p), springs, p), U, X0=X)
+            lost = ~torch.isfinite(end.X).flatten(1).all(-1)
+            end.X[lost], end.U[lost] = X[lost], U[lost]
+            for i, (c, v) in enumerate(along):
+                self.plans.set(v, torch.tensor([c]), end, torch.tensor([i]))
+                self.plans.iterations[c, v] += end.iterations[i]

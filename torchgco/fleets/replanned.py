@@ -5,14 +5,14 @@ M. Erdmann and T. Lozano-Perez, On multiple moving objects, Algorithmica 2 (1987
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED
-from torchgco.fleets.among import SOLVER, Among
-from torchgco.fleets.fleet import Fleet
+from torchgco.fleets.among import SOLVER, Teams
 from torchgco.fleets.negotiated import DEAREST
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords, states_goal
@@ -26,37 +26,27 @@ REPAIRS = 3  # solves among larger others of what touches them between the knots
 BEYOND, MORE = 1.5, 2e-3  # by how much more than it touches they are larger: times, and m
 
 
-class Replanned:
+@dataclass(eq=False)
+class Replanned(Teams):
     """Planning of C teams side by side; their vehicles have turns of their own.
 
     Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each team is, (C,).
-        plans: where its vehicles are; their controls needn't lead to their states.
         orders: in which some of its vehicles plan, of each team.
         known: which vehicles others plan among from the beginning, (C, V) bool; others they do once these have planned.
-        late: whether the time is over.
 
     Attributes:
         lost: vehicles of each team that have found no plan.
     """
 
-    def __init__(
-        self,
-        fleet: Fleet,
-        forms: Sequence[Among],
-        of: Tensor,
-        plans: Plans,
-        orders: Sequence[Sequence[int]],
-        known: Tensor,
-        late: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
-        self.left, self.plans = [list(order) for order in orders], plans.take(torch.arange(len(of)))
-        self.known, self.lost = known.clone(), [list[int]() for _ in orders]
-        each = zip(fleet.members, self.plans.X, self.plans.U, strict=True)
-        self.off = torch.stack([leaves_chords(one.take(of), x, u) for one, x, u in each], dim=1)
+    orders: Sequence[Sequence[int]]
+    known: Tensor
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.left, self.lost = [list(order) for order in self.orders], [list[int]() for _ in self.orders]
+        self.known = self.known.clone()
+        each = zip(self.fleet.members, self.plans.X, self.plans.U, strict=True)
+        self.off = torch.stack([leaves_chords(one.take(self.of), x, u) for one, x, u in each], dim=1)
 
     def run(self) -> Plans:
         """Plans of all teams; vehicles that find none are where they were."""
@@ -100,10 +90,10 @@ class _Turn:
         run, scenes = self.run, dict[int, TimedScene]()
         for i in rows.tolist():
             (c, v), there = self.pairs[i], ~self.radii[i].isnan()
-            ground = self.among.ground(run.fleet, v, int(run.of[c]), run.plans.X[v][c])
+            ground = run.ground(c, v)
             if ground is not None:
                 p, radii = self.p[i][:, there].transpose(0, 1), self.radii[i][there]
-                price = torch.full_like(radii, DEAREST * ground.most)
+                price = torch.full_like(radii, DEAREST * ground.wait)
                 scenes[i] = ground.among(p, radii, price, run.fleet.dt)
         searched = zip(scenes, timed_ways(list(scenes.values()), 1, 0.0), strict=True)
         found = {i: ways for i, ways in searched if ways.points}

@@ -14,16 +14,15 @@ Notes on decomposition methods, 2007).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchgco.constraints.base import ADMITTED, CONTACT_FACTOR
-from torchgco.fleets.among import SOLVER, Among
-from torchgco.fleets.fleet import Fleet
-from torchgco.fleets.forces import balancing_forces, between_two, responses
+from torchgco.fleets.among import SOLVER, Teams
+from torchgco.fleets.forces import balancing_forces, between_two, responses, stiffness
 from torchgco.fleets.plans import Plans
 from torchgco.fleets.verdict import leaves_chords
 from torchgco.kernels import path_clearance
@@ -91,35 +90,30 @@ class Sides:
         push[:, rows.knots] = (2.0 * self.solution.multipliers.lam[self.place].unsqueeze(-1) * away).sum(2)
         return push
 
-    def responses(self, rows: Tensor, position: slice) -> Tensor:
-        """Of places at knots 1..N to forces there, (r, N d, N d), m per unit; NaN where the minimum isn't strict."""
+    def responses(self, rows: Tensor, forces: Tensor, kept: Tensor) -> Tensor:
+        """Of places at knots 1..N to more than the forces of others, (r, N d, N d), m per unit.
+
+        Args:
+            kept: the largest distance that each of these vehicles keeps, (r,), m.
+        """
         solution = self.solution.take(rows)
         lam = list(solution.multipliers.lam)
         del lam[self.place]
         own = replace(solution, multipliers=Multipliers(tuple(lam), solution.multipliers.mu))
-        return responses(self.bare.take(rows), own, position)
+        return responses(self.bare.take(rows), own, forces[rows], stiffness(own.cost, kept, self.bare.N))[0]
 
 
-class SharedRoom:
-    """Rounds of C fleets side by side.
+@dataclass(eq=False)
+class SharedRoom(Teams):
+    """Rounds of C teams side by side."""
 
-    Args:
-        fleet: of which these are.
-        forms: of its vehicles.
-        of: which of the fleets each of the C begins with, (C,): several may be guesses for the same.
-        plans: what they begin with.
-        late: whether the time is over.
-    """
-
-    def __init__(
-        self, fleet: Fleet, forms: Sequence[Among], of: Tensor, plans: Plans, late: Callable[[], bool] = lambda: False
-    ) -> None:
-        self.fleet, self.forms, self.of, self.late = fleet, forms, of, late
-        self.now, self.best = plans.take(torch.arange(len(of))), plans.take(torch.arange(len(of)))
-        C, V, K, like = len(of), fleet.V, fleet.N + 1, fleet.distances
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.now, self.best = self.plans, self.plans.take(torch.arange(len(self.of)))
+        C, V, K, like = len(self.of), self.fleet.V, self.fleet.N + 1, self.fleet.distances
         self.needed = like.view(1, V, V, 1).repeat(C, 1, 1, K)
         self.grown = like.new_zeros(C, V)
-        self.step, self.shift = like.new_ones(C), torch.zeros_like(fleet.places(plans.X))
+        self.step, self.shift = like.new_ones(C), torch.zeros_like(self.fleet.places(self.plans.X))
         self.cost, self.least = like.new_full((C,), torch.inf), like.new_full((C,), torch.inf)
         self.sound = torch.zeros(C, dtype=torch.bool)
         self.live = torch.ones(C, dtype=torch.bool)
@@ -237,7 +231,8 @@ class SharedRoom:
             for place, v in enumerate(part.whose):
                 forces[:, v] = push[place * len(rows) + again]
             at = torch.cat([place * len(rows) + again for place in range(len(part.whose))])
-            found = part.responses(at, position)
+            kept = self.fleet.distances.amax(-1)[list(part.whose)].repeat_interleave(c)
+            found = part.responses(at, push, kept)
             for place, v in enumerate(part.whose):
                 answers[:, v] = found[place * c : (place + 1) * c]
         chosen = rows[again]

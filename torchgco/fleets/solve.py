@@ -104,7 +104,7 @@ def _come_apart(best: _Best, forms: list[Among], side: float, late: Callable[[],
     if len(rows) == 0 or late():
         return
     guesses = aside(best.fleet, forms, rows, best.alone.take(rows), side)
-    apart = ComingApart(best.fleet, forms, rows, guesses, late)
+    apart = ComingApart(best.fleet, forms, rows, guesses, late=late)
     plans = apart.run()
     near = apart.near.nonzero().flatten()
     _improve(best, forms, rows[near], plans.take(near), late)
@@ -130,7 +130,7 @@ def _improve(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, late: 
     for again in (True, False):
         if len(rows) == 0 or late():
             return
-        plans = SharedRoom(best.fleet, forms, rows, plans, late).run()
+        plans = SharedRoom(best.fleet, forms, rows, plans, late=late).run()
         best.offer(rows, plans)
         left = (~best.verdict.reached[rows]).nonzero().flatten()
         if len(left) == 0 or not again:
@@ -151,7 +151,7 @@ def _plan_again(best: _Best, forms: list[Among], rows: Tensor, plans: Plans, lat
     orders = [(~one).nonzero().flatten().tolist() for one in known & verdict.apart]
     before = torch.full_like(verdict.cost, torch.nan)
     for i in range(ORDERS):
-        run = Replanned(best.fleet, forms, rows, plans, orders, known, late)
+        run = Replanned(best.fleet, forms, rows, plans, orders, known, late=late)
         now = best.offer(rows, run.run())
         cost = torch.where(now.reached, now.cost, torch.nan)
         left = (~((cost - before).abs() <= SAME * cost.abs())).nonzero().flatten()
@@ -176,7 +176,7 @@ def _relieve(best: _Best, forms: list[Among], late: Callable[[], bool]) -> None:
         return
     due = [[v] for v in paid[rows].argmax(-1).tolist()]
     orders = [list(range(best.fleet.V))] * len(rows)
-    plans = Negotiated(best.fleet, forms, rows, best.plans.take(rows), orders, due, late).run()
+    plans = Negotiated(best.fleet, forms, rows, best.plans.take(rows), orders, due, late=late).run()
     _improve(best, forms, rows, plans, late)
 
 

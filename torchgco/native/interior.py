@@ -84,8 +84,8 @@ class InteriorKernels:
         return KktSolve(sides["a"], sides["b"], sides["c"], left, costates, definite)
 
     def responses(
-        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, K: Tensor,
-        states: slice,
+        self, problem: Problem, X: Tensor, U: Tensor, multipliers: tuple[Tensor, ...], active: Tensor, give: Tensor,
+        K: Tensor, states: slice,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """Responses of some states at knots 1..N to forces there, (B, N d, N d), and whether minima are strict, (B,).
 
@@ -95,7 +95,7 @@ class InteriorKernels:
         found, none = X.new_zeros(problem.B, problem.N * d, problem.N * d), X.new_zeros(0)
         asked: dict[str, Any] = {"responses": found, "first": states.start, "d": d, "count": 0}
         asked |= dict.fromkeys(("a", "b", "c", "left"), none)
-        _, definite = self._factored(problem, X, U, multipliers, active, None, K, asked)
+        _, definite = self._factored(problem, X, U, multipliers, active, give.contiguous(), K, asked)
         return found, definite
 
     def _factored(

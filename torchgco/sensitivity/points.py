@@ -98,7 +98,7 @@ def points_of(problem: Problem, solution: Solution, smoothing: float = 0.0) -> P
     growth = torch.where(reason == Why.DIFFERENTIABLE, growth, 0.0)
     problem = problem.grown(growth) if bool((growth > 0).any()) else problem
     if smoothing > 0:
-        active, give, gap = _rows_in_barrier(problem, result, smoothing)
+        active, give, gap = rows_in_barrier(problem, result, smoothing)
     else:
         (active, untold), give, gap = rows_that_hold(problem, result), None, None
         weak = (untold.any(-1) & (reason == Why.DIFFERENTIABLE)).nonzero().flatten()
@@ -166,7 +166,7 @@ def rows_that_hold(problem: Problem, solution: Solution) -> tuple[Tensor, Tensor
     return torch.cat(hold, dim=1), torch.cat(untold, dim=1)
 
 
-def _rows_in_barrier(problem: Problem, solution: Solution, mu: float) -> tuple[Tensor, Tensor, Tensor]:
+def rows_in_barrier(problem: Problem, solution: Solution, mu: float) -> tuple[Tensor, Tensor, Tensor]:
     """Which rows hold, with the give and gap of those in the barrier, (B, R) all.
 
     Slack times multiplier is mu there, and 0 of equalities, of bounds that coincide and of rows that no variable moves.
