@@ -12,7 +12,6 @@ from torchgco.exploration.sensing.grid import FREE, OCCUPIED, SeenMap
 from torchgco.exploration.sensing.sensors import Motion, Scan, World
 
 BESIDE = 0.3  # m around a ball, within which returns are its own
-JOINED = 0.4  # m: returns closer than about this belong to one body
 LEAST_RETURNS = 2  # returns of a body at least
 SURFACE = 0.05  # m: error of a face that rays end on, by noise and as bodies move during a scan
 EDGE = 0.3  # of the distance between two rays: by how much a face that lies beside them errs, uniform between both
@@ -286,14 +285,14 @@ class Tracks:
         loose = self._loose(seen, points)
         if self.tracks and loose.any():
             gaps = self.now(t).each(points[loose], np.zeros(loose.sum()))
-            nearest = np.where(gaps.min(axis=1) <= BESIDE, gaps.argmin(axis=1), -1)
             own = np.full(len(points), -1)
-            own[loose] = nearest
+            own[loose] = np.where(gaps.min(axis=1) <= BESIDE, gaps.argmin(axis=1), -1)
             for i, track in enumerate(self.tracks):
-                if (own == i).sum() >= LEAST_RETURNS:
-                    track.take(*self._seen_box(points[own == i], scan.origin), t)
-                    loose &= own != i
-        for members in clusters(points[loose]):
+                rows = np.flatnonzero(own == i)
+                if len(rows) >= LEAST_RETURNS and np.ptp(points[rows], axis=0).max() <= LARGEST_BODY:
+                    track.take(*self._seen_box(points[rows], scan.origin), t)
+                    loose[rows] = False
+        for members in clusters(points[loose], scan.origin, self.pitch):
             self._begin(points[loose][members], scan.origin, t)
         self.tracks = [track for track in self.tracks if t - track.last <= GIVEN_UP and not self._rests(track, seen, t)]
         keep[rays] = ~self.now(t).holds(points)
@@ -369,11 +368,15 @@ def returns(scan: Scan) -> np.ndarray:
     return scan.origin + np.where(np.isfinite(scan.distances), scan.distances, 0.0)[:, None] * scan.directions
 
 
-def clusters(points: np.ndarray) -> list[np.ndarray]:
-    """The indices of the points (R, 3) of each cluster: of cubes of `JOINED` that touch."""
+def clusters(points: np.ndarray, origin: np.ndarray, pitch: float) -> list[np.ndarray]:
+    """The indices of the points (R, 3) of each cluster, seen from `origin` (3,): less than about two rays apart."""
     if len(points) == 0:
         return []
-    cubes = np.floor((points - points.min(axis=0)) / JOINED).astype(int)
+    away = points - origin
+    far = np.linalg.norm(away, axis=1).clip(1e-3)
+    angles = np.log(far), np.arctan2(away[:, 1], away[:, 0]), np.arcsin(away[:, 2] / far)
+    cubes = np.column_stack(angles) / pitch
+    cubes = np.floor(cubes - cubes.min(axis=0)).astype(int)
     grid = np.zeros(cubes.max(axis=0) + 1, bool)
     grid[tuple(cubes.T)] = True
     names, count = label(grid, np.ones((3, 3, 3)))
