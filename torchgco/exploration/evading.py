@@ -22,8 +22,15 @@ Gaps = Callable[[np.ndarray], np.ndarray]  # distances (K,), m, of points (K, 3)
 
 
 def evaded(
-    points: np.ndarray, velocity: np.ndarray, weights: Sequence[float], moving: Moving, static: Gaps, keep: float,
-    dt: float, hold: float, pace: Pace,
+    points: np.ndarray,
+    velocity: np.ndarray,
+    weights: Sequence[float],
+    moving: Moving,
+    static: Gaps,
+    keep: float,
+    dt: float,
+    hold: float,
+    pace: Pace,
 ) -> np.ndarray:
     """Positions (N+1, 3), m, near `points` (N+1, 3), one every dt, s, that keep away from moving bodies.
 
@@ -69,8 +76,14 @@ def _lattice(points: np.ndarray, tau: float, pace: Pace) -> TimedLattice:
 
 
 def _scene(
-    lattice: TimedLattice, points: np.ndarray, velocity: np.ndarray, weights: Sequence[float], moving: Moving,
-    static: Gaps, keep: float, hold: float,
+    lattice: TimedLattice,
+    points: np.ndarray,
+    velocity: np.ndarray,
+    weights: Sequence[float],
+    moving: Moving,
+    static: Gaps,
+    keep: float,
+    hold: float,
 ) -> TimedScene:
     """What is in the way, and what ways cost: squared distances from the points (N+1, 3), and rest at the end."""  # fmt: skip
     cells, times = lattice.points, lattice.tau / PARTS * np.arange(lattice.layers * PARTS + 1)

@@ -21,6 +21,7 @@ ACCELERATION = 1.0  # m/s^2: standard deviation of what bodies do between two sc
 FASTEST = 1.0  # m/s: standard deviation of a velocity before anything is known of it
 LOOK = 10  # scans of a body between two looks whether it has moved
 STAYS = 0.25  # m: a body that has moved by less is at rest
+SETTLES = 1.0  # s after which a cell that stays occupied is one of a surface: bodies that move leave it by then
 GIVEN_UP = 0.6  # s without a return, after which a body is given up
 LOOKS = 6  # moments at which bodies are looked at while a point stays clear
 # m/s^2: the largest change of velocity that is expected of what is followed, by which it grows ahead of its time, and m
@@ -220,6 +221,7 @@ class Track:
         last, scans: time of the last scan with it, s, and the number of scans with it.
         origin, began: where and when it was at the last look whether it moves, m and s.
         spread: covariance of place and velocity, (2, 2), the same along each axis.
+        moves: whether it has left where it was at a look.
     """
 
     center: np.ndarray
@@ -231,6 +233,7 @@ class Track:
     began: float
     scans: int = 1
     spread: np.ndarray = field(default_factory=lambda: np.diag([1.0, FASTEST**2]))
+    moves: bool = False
 
     def expected(self, t: float) -> np.ndarray:
         """Where it should be at time t, s, (3,), m."""
@@ -276,68 +279,108 @@ class Tracks:
     pitch: float
     tracks: list[Track] = field(default_factory=list)
     _was_free: np.ndarray | None = None  # (cells,) bool
+    _settled: np.ndarray | None = None  # (cells,) float32: when what is in an occupied cell counts as a surface, s
+    _last: float = 0.0  # s: time of the last scan
 
     def observe(self, scan: Scan, seen: SeenMap, t: float) -> np.ndarray:
         """See `Movers`."""
         keep, points = np.ones(len(scan.distances), bool), returns(scan)
         rays = np.flatnonzero(np.isfinite(scan.distances))
         points = points[rays]
+        self._last = t
         loose = self._loose(seen, points)
-        if self.tracks and loose.any():
-            gaps = self.now(t).each(points[loose], np.zeros(loose.sum()))
-            own = np.full(len(points), -1)
-            own[loose] = np.where(gaps.min(axis=1) <= BESIDE, gaps.argmin(axis=1), -1)
-            for i, track in enumerate(self.tracks):
-                rows = np.flatnonzero(own == i)
-                if len(rows) >= LEAST_RETURNS and np.ptp(points[rows], axis=0).max() <= LARGEST_BODY:
-                    track.take(*self._seen_box(points[rows], scan.origin), t)
-                    loose[rows] = False
+        self._follow([track for track in self.tracks if track.moves], points, loose, scan.origin, t)
+        large = self._large(seen, points, loose, scan.origin)
+        self._follow([track for track in self.tracks if not track.moves], points, loose, scan.origin, t)
         for members in clusters(points[loose], scan.origin, self.pitch):
             self._begin(points[loose][members], scan.origin, t)
         self.tracks = [track for track in self.tracks if t - track.last <= GIVEN_UP and not self._rests(track, seen, t)]
-        keep[rays] = ~self.now(t).holds(points)
+        keep[rays] = ~self.now(t).holds(points) | large
         return keep
+
+    def _follow(self, tracks: list[Track], points: np.ndarray, loose: np.ndarray, origin: np.ndarray, t: float) -> None:
+        """Continue tracks by the `loose` ones (R,) bool of points (R, 3), which those that belong to one leave."""
+        if not tracks or not loose.any():
+            return
+        gaps = self._expected(tracks, t).each(points[loose], np.zeros(int(loose.sum())))
+        own = np.full(len(points), -1)
+        own[loose] = np.where(gaps.min(axis=1) <= BESIDE, gaps.argmin(axis=1), -1)
+        for i, track in enumerate(tracks):
+            rows = np.flatnonzero(own == i)
+            if len(rows) >= LEAST_RETURNS and np.ptp(points[rows], axis=0).max() <= LARGEST_BODY:
+                track.take(*self._seen_box(points[rows], origin), t)
+                loose[rows] = False
+
+    def _large(self, seen: SeenMap, points: np.ndarray, loose: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Which points (R, 3) belong to what is too large for a body, (R,) bool; no longer `loose`, but surfaces."""
+        large = np.zeros(len(points), bool)
+        for members in clusters(points[loose], origin, self.pitch):
+            rows = np.flatnonzero(loose)[members]
+            large[rows] = np.ptp(points[rows], axis=0).max() > LARGEST_BODY
+        loose &= ~large
+        cells = np.floor((points[large] - seen.corner) / seen.resolution).astype(np.int64)
+        if large.any():
+            self._settle(seen, tuple(cells.T))
+        return large
+
+    def _settle(self, seen: SeenMap, cells: Any) -> None:
+        """Take what is in some cells for a surface, from now on."""
+        assert self._was_free is not None and self._settled is not None
+        self._was_free.reshape(seen.shape)[cells] = False
+        self._settled.reshape(seen.shape)[cells] = -np.inf
 
     def _rests(self, track: Track, seen: SeenMap, t: float) -> bool:
         """Whether a body has stayed where it was; its cells are then those of a surface."""
         if track.scans % LOOK or track.last < t:
             return False
         if np.linalg.norm(track.center - track.origin) > STAYS:
-            track.origin, track.began = track.center, t
+            track.origin, track.began, track.moves = track.center, t, True
             return False
-        assert self._was_free is not None
         low, high = (seen.cell(track.center + side * (track.half + BESIDE)) for side in (-1.0, 1.0))
-        self._was_free.reshape(seen.shape)[tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True))] = False
+        self._settle(seen, tuple(slice(a, b + 1) for a, b in zip(low, high, strict=True)))
         return True
 
     def note(self, seen: SeenMap, changed: np.ndarray) -> None:
         """See `Movers`."""
         was_free = (seen.state == FREE).ravel() if self._was_free is None else self._was_free
-        was_free[changed[seen.state.ravel()[changed] == FREE]] = True
-        self._was_free = was_free
+        settled = np.full(was_free.shape, np.inf, np.float32) if self._settled is None else self._settled
+        free, occupied = (changed[seen.state.ravel()[changed] == state] for state in (FREE, OCCUPIED))
+        was_free[free], settled[free] = True, np.inf
+        settled[occupied] = np.minimum(settled[occupied], self._last + SETTLES)
+        self._was_free, self._settled = was_free, settled
 
     def now(self, t: float) -> Moving:
         """See `Movers`."""
-        if not self.tracks:
+        return self._expected(self.tracks, t)
+
+    def _expected(self, tracks: list[Track], t: float) -> Moving:
+        """Bodies that are followed, where they should be at time t, s."""
+        if not tracks:
             return nothing()
-        centers = np.array([track.expected(t) for track in self.tracks])
-        half = np.array([track.half for track in self.tracks])
+        centers = np.array([track.expected(t) for track in tracks])
+        half = np.array([track.half for track in tracks])
         straight = np.broadcast_to(np.eye(3), (len(centers), 3, 3))
-        motion = Motion.steady(np.array([track.velocity for track in self.tracks]))
-        error = np.array([track.error for track in self.tracks])
+        motion = Motion.steady(np.array([track.velocity for track in tracks]))
+        error = np.array([track.error for track in tracks])
         return Moving(centers, motion, error, GROWTH, half, straight)
 
     def _loose(self, seen: SeenMap, points: np.ndarray) -> np.ndarray:
-        """Which points (R, 3) aren't in or beside occupied cells that never were free, (R,) bool."""
+        """Which points (R, 3) aren't in or beside cells of surfaces, (R,) bool: occupied for long, and never free.
+
+        What has just come into sight may move: the cells that it leaves behind would make it a surface for good.
+        """
         cells = np.floor((points - seen.corner) / seen.resolution).astype(np.int64)
         loose = np.atleast_1d(((cells >= 1) & (cells < np.array(seen.shape) - 1)).all(axis=1))
         if self._was_free is None or not loose.any():
             return np.zeros(len(points), bool)
         index = np.atleast_1d(np.ravel_multi_index(tuple(cells[loose].T), seen.shape))
-        was, state = self._was_free, seen.state.ravel()
+        assert self._settled is not None
         steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
         around = index[:, None] + steps @ np.array([seen.shape[1] * seen.shape[2], seen.shape[2], 1])
-        loose[loose] = ~((state[around] == OCCUPIED) & ~was[around]).any(axis=1)
+        surface = (
+            (seen.state.ravel()[around] == OCCUPIED) & ~self._was_free[around] & (self._settled[around] <= self._last)
+        )
+        loose[loose] = ~surface.any(axis=1)
         return loose
 
     def _begin(self, points: np.ndarray, origin: np.ndarray, t: float) -> None:
