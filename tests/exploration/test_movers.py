@@ -97,8 +97,8 @@ def test_returns_are_joined_to_clusters_and_single_ones_left_out() -> None:
 def test_bodies_are_parted_where_they_are_close() -> None:
     """Two bodies 0.4 m from each other: at 4 m rays lie 0.2 m apart and tell them, at 16 m 0.8 m apart, and don't."""
     sides = np.linspace(0.0, 0.6, 4)[:, None] * [0.0, 1.0, 0.0]
-    both = np.concatenate([sides, sides + [0.0, 1.0, 0.0]])
-    assert [len(clusters(both + [far, 0.0, 0.0], np.zeros(3), 0.05)) for far in (4.0, 16.0)] == [2, 1]
+    both = np.concatenate([sides, sides + np.array([0.0, 1.0, 0.0])])
+    assert [len(clusters(both + np.array([far, 0.0, 0.0]), np.zeros(3), 0.05)) for far in (4.0, 16.0)] == [2, 1]
 
 
 def test_a_body_is_as_deep_as_it_is_wide() -> None:

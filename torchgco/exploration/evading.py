@@ -85,20 +85,29 @@ def _scene(
     keep: float,
     hold: float,
 ) -> TimedScene:
-    """What is in the way, and what ways cost: squared distances from the points (N+1, 3), and rest at the end."""  # fmt: skip
+    """What is in the way, and what ways cost: squared distances from the points (N+1, 3), and rest at the end."""
     cells, times = lattice.points, lattice.tau / PARTS * np.arange(lattice.layers * PARTS + 1)
     centers, radii = moving.at(times)
     field = Surroundings(
-        torch.from_numpy(static(cells)).float().expand(len(times), -1).contiguous(),
-        *(torch.from_numpy(a).float().contiguous() for a in (centers - lattice.origin, moving.half_sizes)),
-        torch.from_numpy(np.array(moving.sides)).float(), torch.from_numpy(radii).float(), 0,
-    )  # fmt: skip
+        _float(static(cells)).expand(len(times), -1).contiguous(),
+        _float(centers - lattice.origin),
+        _float(moving.half_sizes),
+        _float(moving.sides),
+        _float(radii),
+        0,
+    )
     cost = LAYER * (np.square(cells - points[::LAYER, None]) @ np.asarray(weights))  # (layers + 1, cells)
     end, v = cost[-1:].copy(), np.abs(lattice.velocities)
     for late in times[-1] + np.linspace(0.0, hold, LOOKS):
         end[0, moving.gaps(cells, np.full(len(cells), late)) < keep] = FAR
     move, last = np.zeros(len(v)), np.where(v.max(axis=1) > 0, FAR, 0.0)
-    first = lattice.move(velocity)
-    parts = (cost[:-1], end, move, last, np.zeros(3))
-    tensors = [torch.from_numpy(part).float().contiguous() for part in parts]
-    return TimedScene(lattice, field, *tensors, lattice.cell(points[0]), first, keep)
+    costs = _float(cost[:-1]), _float(end), _float(move), _float(last), _float(np.zeros(3))
+    return TimedScene(
+        lattice=lattice, field=field, cell_cost=costs[0], end_cost=costs[1], move_cost=costs[2], last_cost=costs[3],
+        change=costs[4], start=lattice.cell(points[0]), first=lattice.move(velocity), margin=keep,
+    )  # fmt: skip
+
+
+def _float(values: np.ndarray) -> torch.Tensor:
+    """Numbers as C takes them."""
+    return torch.from_numpy(np.array(values, np.float32))

@@ -1,4 +1,4 @@
-"""Bodies that move: known, or followed in the returns of a sensor, as balls at constant velocity."""
+"""Bodies that move: known, or followed in the returns of a sensor, as boxes at constant velocity."""
 
 from __future__ import annotations
 
@@ -268,9 +268,9 @@ def _eased(off: np.ndarray, outward: float) -> np.ndarray:
 class Tracks:
     """Bodies that may move, followed from scan to scan.
 
-    A body is a cluster of returns of limited size, away from surfaces in cells that never were free. Each return belongs
-    to the body whose box it is nearest to. Until a body has been seen for some scans, and while it moves, its returns
-    stay out of the map; one that turns out to be at rest goes into it.
+    A body is a cluster of returns of limited size, away from surfaces in cells that never were free. Each return
+    belongs to the body whose box it is nearest to. Until a body has been seen for some scans, and while it moves, its
+    returns stay out of the map; one that turns out to be at rest goes into it.
 
     Args:
         pitch: angle between two rays, rad: a body may be wider than its returns by that.
