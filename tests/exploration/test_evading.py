@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
-from torchgco.exploration.evading import evaded, offsets
+from torchgco.exploration.evading import evaded
 from torchgco.exploration.movers import Known, Moving
+from torchgco.exploration.reference import Pace
 from torchgco.exploration.sensing import World
 from torchgco.exploration.sensing.sensors import Motion
 
-DT, KEEP, HOLD = 0.05, 0.3, 1.0
+DT, KEEP, HOLD, PACE = 0.05, 0.3, 1.0, Pace(4.7, 5.0, 3.5)
 LINE = np.column_stack([4.0 * DT * np.arange(61), np.zeros(61), np.full(61, 2.0)])  # 4 m/s for 3 s
 
 
@@ -22,6 +26,11 @@ def swinging(seed: int, count: int = 9) -> tuple[Moving, np.ndarray, Motion]:
     sines = rng.uniform(-1, 1, (count, 2, 3)), rng.uniform(0.2, 1, (count, 2, 3)), rng.uniform(0, 6, (count, 2, 3))
     motion = Motion(rng.uniform(-0.5, 0.5, (count, 3)), *sines)
     return Known(World(boxes, motion)).now(0.0), boxes, motion
+
+
+def around(moving: Moving, static: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """The way along the line at 4 m/s."""
+    return evaded(LINE, np.array([4.0, 0.0, 0.0]), [4.0, 4.0, 8.0], moving, static, KEEP, DT, HOLD, PACE)
 
 
 def far(points: np.ndarray) -> np.ndarray:
@@ -76,7 +85,7 @@ def test_a_last_point_stays_clear() -> None:
 
 def test_a_clear_way_stays_as_it_is() -> None:
     away = Moving.balls(np.array([[6.0, 9.0, 2.0]]), np.zeros((1, 3)), np.array([0.5]))
-    assert evaded(LINE, away, far, KEEP, DT, HOLD) is LINE
+    assert around(away, far) is LINE
 
 
 def test_ways_lead_around_what_would_be_met() -> None:
@@ -87,9 +96,9 @@ def test_ways_lead_around_what_would_be_met() -> None:
         if before[:10].min() < 1.0 or before.min() > KEEP:
             continue
         found += 1
-        way = evaded(LINE, moving, far, KEEP, DT, HOLD)
+        way = around(moving, far)
         gaps = [distance(boxes, motion, p, s).min() for p, s in zip(way, t, strict=True)]
-        assert min(gaps) > KEEP - 0.15 and np.allclose(way[0], LINE[0])  # nodes keep it, means between them nearly
+        assert min(gaps) > KEEP - 0.15 and np.allclose(way[0], LINE[0])  # the lattice keeps it, the spline nearly
         assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() < 0.5
     assert found >= 4
 
@@ -98,13 +107,24 @@ def test_a_way_waits_where_it_can_not_pass() -> None:
     """A ball crosses the way from below; what rests bars all places aside."""
     ball = Moving.balls(np.array([[6.0, 0.0, -1.0]]), np.array([[0.0, 0.0, 2.0]]), np.array([0.4]))
     beside = lambda p: np.where(np.abs(p[:, 1]) + np.abs(p[:, 2] - 2.0) > 0.2, 0.0, 9.0)
-    way, t = evaded(LINE, ball, beside, KEEP, DT, HOLD), DT * np.arange(61)
+    way, t = around(ball, beside), DT * np.arange(61)
     assert ball.gaps(LINE, t).min() < KEEP
     assert ball.gaps(way, t).min() > ball.gaps(LINE, t).min() + 0.4 and way[30, 0] < LINE[30, 0] - 0.5
     assert np.abs(way[:, 1]).max() < 1e-9
 
 
-def test_offsets_lie_across_the_way() -> None:
-    sides = offsets(LINE)
-    assert (sides[:, 0] == 0).all() and (sides[len(sides) // 2] == 0).all()
-    assert np.abs(sides[:, 1]).max() == 2.0 and np.abs(sides[:, 2]).max() == 1.0
+def test_a_way_begins_with_the_velocity_and_ends_at_rest() -> None:
+    """A ball that rests on the line, and grows as fast as a vehicle that follows the line would come to it."""
+    ball = Moving.balls(np.array([[7.0, 0.0, 2.0]]), np.zeros((1, 3)), np.array([0.5]), growth=0.5)
+    way, t = around(ball, far), DT * np.arange(61)
+    assert ball.gaps(LINE, t).min() < 0.0 and ball.gaps(way, t).min() > KEEP - 0.15
+    assert np.allclose(way[1] - way[0], [4.0 * DT, 0.0, 0.0], atol=0.03) and np.allclose(way[-1], way[-2], atol=0.02)
+
+
+def test_where_bodies_bar_all_ways_by_what_they_may_do_those_they_bar_now_count() -> None:
+    """Balls 1.6 m apart on all sides leave ways between them, and none once they have grown."""
+    centers = np.stack(np.meshgrid(*[1.6 * np.arange(-4.5, 10.0)] * 3), axis=-1).reshape(-1, 3) + LINE[0]
+    balls, t = Moving.balls(centers, np.zeros_like(centers), np.full(len(centers), 0.3), growth=1.0), DT * np.arange(61)
+    now = replace(balls, growth=0.0)
+    way = around(balls, far)
+    assert way is not LINE and balls.gaps(LINE, t).min() < 0.0 and now.gaps(way, t).min() > KEEP - 0.15

@@ -25,6 +25,7 @@ from torchgco.exploration.explorer import (
     PLANES,
     SEARCH_OPTIONS,
     SPARE,
+    STATE,
     Explorer,
     PlanningForm,
     Scout,
@@ -193,7 +194,8 @@ class Exploration:
             scout.moving = scout.moving.within(p[0] - around, p[0] + around, horizon + CLEAR_AFTER).clear_of(p[0], keep)
             if len(scout.moving.radii):
                 static = lambda q, scout=scout, keep=keep: scout.seen.gaps(q, keep + 0.3, self.kinds)
-                way = evaded(p, scout.moving, static, keep, self.dt, CLEAR_AFTER)
+                v, pace = reference[b, 0, 3:6].numpy(), self.explorer.pace
+                way = evaded(p, v, STATE[:3], scout.moving, static, keep, self.dt, CLEAR_AFTER, pace)
                 if way is not p:
                     reference[b, :, :3] = torch.from_numpy(way)
                     reference[b, :, 3:6] = torch.from_numpy(np.gradient(way, self.dt, axis=0))

@@ -103,7 +103,8 @@ class Surroundings:
     Args:
         away: from all else at `PARTS` times a layer, (layers PARTS + 1, cells), float32, m; infinite without any.
         center: of S solids at these times, (layers PARTS + 1, S, d), float32, m, from the first cell.
-        half, axes, radius: of rounded boxes, (S, d), (S, d, d), (S,), float32, m; rows of `axes` are sides' directions.
+        half, axes: of rounded boxes, (S, d), (S, d, d), float32, m; rows of `axes` are sides' directions.
+        radius: by which they are rounded, (S,), or at these times, (layers PARTS + 1, S), float32, m.
         resting: so many of them come first, and rest.
     """
 
@@ -166,8 +167,9 @@ class TimedScene:
         return Timed(
             counts=counts, least=least, moves=moves, layers=a.layers, parts=PARTS, start=self.start, first=self.first,
             earliest=a.layers + 1 - len(self.end_cost), spacing=a.spacing, margin=self.margin, dearer=dearer,
-            solids=len(field.radius), resting=field.resting, center=field.center, half=field.half, axes=field.axes,
-            radius=field.radius, **self._met(), clearance=field.away.clone(), cell_cost=self.cell_cost,
+            solids=len(field.half), resting=field.resting, center=field.center, half=field.half, axes=field.axes,
+            radius=field.radius.expand(field.center.shape[:2]).contiguous(), **self._met(),
+            clearance=field.away.clone(), cell_cost=self.cell_cost,
             end_cost=self.end_cost, move_cost=self.move_cost, last_cost=self.last_cost, change=self.change, most=most,
             tries=TRIES, found=0,
             way=torch.empty(most, a.layers + 1, dtype=torch.int32), end=torch.empty(most, dtype=torch.int32),

@@ -12,7 +12,8 @@ typedef struct {
     double dearer; /* share by which ways may cost more than the cheapest */
     int64_t solids, resting; /* rounded boxes, of which the first ones rest */
     const float *center; /* (layers * parts + 1, solids, DIM): where they are, from the first cell, m */
-    const float *half, *axes, *radius; /* (solids, DIM), (solids, DIM, DIM), (solids): m; rows of axes are sides */
+    const float *half, *axes; /* (solids, DIM), (solids, DIM, DIM): m; rows of axes are sides */
+    const float *radius; /* as center, without DIM: by which they are rounded, m */
     float *clearance; /* (layers * parts + 1, cells), m: of all else; then of the solids, too */
     int64_t others; /* balls that may be met, at a price */
     const float *other, *reach, *price; /* (layers * parts + 1, others, DIM), (others), (others): as center; m; of being

@@ -70,9 +70,9 @@ static int64_t moved(const Sweep *w, const int64_t *at, int64_t cell, const int3
 }
 
 /* Lower the distances of a row of cells to those from one solid; `v` leads there from its centre, at the first cell. */
-static void lowered(const Timed *t, int64_t i, float *row, int64_t count, const float *v) {
+static void lowered(const Timed *t, int64_t i, float radius, float *row, int64_t count, const float *v) {
     const float *half = t->half + i * DIM, *axes = t->axes + i * DIM * DIM;
-    float radius = t->radius[i], h = (float)t->spacing, begin[DIM], along[DIM], square = 0.0f, size = 0.0f;
+    float h = (float)t->spacing, begin[DIM], along[DIM], square = 0.0f, size = 0.0f;
     for (int k = 0; k < DIM; k++) {
         begin[k] = 0.0f, along[k] = h * axes[k * DIM + DIM - 1], size += half[k];
         for (int a = 0; a < DIM; a++) begin[k] += axes[k * DIM + a] * v[a];
@@ -121,21 +121,22 @@ static int has_next(int64_t *at, const int64_t *low, const int64_t *high) {
     return a >= 0;
 }
 
-/* Lower the distances of all cells nearer than `far` to a solid at one time. */
-static void lower_around(const Sweep *w, int64_t i, const float *center, float far, float *field) {
+/* Lower the distances of all cells nearer than `far` to a solid at one time, k. */
+static void lower_around(const Sweep *w, int64_t i, int64_t k, float far, float *field) {
     const Timed *t = w->t;
+    const float *center = t->center + (k * t->solids + i) * DIM, radius = t->radius[k * t->solids + i];
     int64_t low[DIM], high[DIM], at[DIM];
     double reach[DIM];
     float v[DIM];
     for (int a = 0; a < DIM; a++) {
-        reach[a] = far + t->radius[i];
-        for (int k = 0; k < DIM; k++) reach[a] += fabsf(t->axes[(i * DIM + k) * DIM + a]) * t->half[i * DIM + k];
+        reach[a] = far + radius;
+        for (int s = 0; s < DIM; s++) reach[a] += fabsf(t->axes[(i * DIM + s) * DIM + a]) * t->half[i * DIM + s];
     }
     if (!is_window(t, center, reach, low, high)) return;
     memcpy(at, low, sizeof at);
     do {
         int64_t cell = row_of(w, at, center, v);
-        lowered(t, i, field + cell, high[DIM - 1] - low[DIM - 1] + 1, v);
+        lowered(t, i, radius, field + cell, high[DIM - 1] - low[DIM - 1] + 1, v);
     } while (has_next(at, low, high));
 }
 
@@ -144,12 +145,11 @@ static void measure(const Sweep *w, float *rest) {
     const Timed *t = w->t;
     float far = (float)(t->margin + t->spacing * sqrt(DIM));
     for (int64_t c = 0; c < w->cells; c++) rest[c] = far;
-    for (int64_t i = 0; i < t->resting; i++) lower_around(w, i, t->center + i * DIM, far, rest);
+    for (int64_t i = 0; i < t->resting; i++) lower_around(w, i, 0, far, rest);
     for (int64_t k = 0; k <= t->layers * t->parts; k++) {
         float *field = t->clearance + k * w->cells;
         for (int64_t c = 0; c < w->cells; c++) field[c] = lower(field[c], rest[c]);
-        for (int64_t i = t->resting; i < t->solids; i++)
-            lower_around(w, i, t->center + (k * t->solids + i) * DIM, far, field);
+        for (int64_t i = t->resting; i < t->solids; i++) lower_around(w, i, k, far, field);
     }
 }
 
