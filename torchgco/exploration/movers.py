@@ -25,7 +25,7 @@ SETTLES = 1.0  # s after which a cell that stays occupied is one of a surface: b
 GIVEN_UP = 0.6  # s without a return, after which a body is given up
 LOOKS = 6  # moments at which bodies are looked at while a point stays clear
 # m/s^2: the largest change of velocity that is expected of what is followed, by which it grows ahead of its time, and m
-# at most: nine of ten points of cubes on trefoils, seen within 7 m, are 0.1, 0.4 and 0.8 m off after 0.5, 1 and 1.5 s.
+# at most: nine of ten points of cubes on trefoils, seen within 7 m, are 0.2, 0.6 and 0.9 m off after 0.5, 1 and 1.5 s.
 GROWTH, MOST_GROWTH = 0.75, 1.0
 
 
