@@ -102,8 +102,8 @@ class MPC:
         if solver is None:
             solver = "gco" if problem.obstacles else "interior_point"
         self._previous = previous_of(problem)
-        if self._previous and self.period < self.dt:
-            asked, problem = (in_periods(one, self.period / self.dt) for one in (asked, problem))
+        if self._previous:
+            asked, problem = (in_periods(one, min(1.0, self.period / self.dt)) for one in (asked, problem))
         self._motion = Motion(problem)
         places = self._motion.places
         changes = None if changes is None else ["x0", *self._previous, *places, *changes]
