@@ -157,6 +157,19 @@ def test_the_problem_of_a_loop_has_its_rates_already(tmp_path: Path) -> None:
         assert np.array_equal(value, load_c(again).numbers[name]), name
 
 
+@pytest.mark.parametrize("period", [None, 0.1, 0.15])
+def test_the_problem_of_a_loop_of_short_periods_serves_whole_stages(period: float | None, tmp_path: Path) -> None:
+    """It kept the rates of the short periods."""
+    short = MPC(gentle(), "interior_point", 0.05).compiled
+    c = load_c(torchgco.export_c(short, tmp_path, "car", period=period))
+    again = MPC(short.problem, "interior_point", period, max_seconds=INF)
+    for lower, upper in (
+        (c.numbers["constraints_2_lower"], c.numbers["constraints_2_upper"]),
+        (again.numbers["constraints[2].lower"], again.numbers["constraints[2].upper"]),
+    ):
+        assert np.allclose(np.reshape(lower, (-1, 2)), FALL) and np.allclose(np.reshape(upper, (-1, 2)), RISE)
+
+
 @pytest.mark.parametrize("options", [{"period": 0.0}, {"period": "1"}, {"period": 0.1, "receding": False}])
 def test_periods_that_are_none(options: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="period"):

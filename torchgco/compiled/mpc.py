@@ -103,8 +103,8 @@ class MPC:
             solver = "gco" if problem.obstacles else "interior_point"
         self._spans_stages = self._free or self.period > self.dt  # whether a period may be longer than one
         self._previous = previous_of(problem)
-        if self._previous and self.period < self.dt:
-            asked, problem = (in_periods(one, self.period / self.dt) for one in (asked, problem))
+        if self._previous:
+            asked, problem = (in_periods(one, min(1.0, self.period / self.dt)) for one in (asked, problem))
         self._motion = Motion(problem)
         places = self._motion.places
         changes = None if changes is None else ["x0", *self._previous, *places, *changes]

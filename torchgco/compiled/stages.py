@@ -60,11 +60,11 @@ def in_periods(problem: Problem, share: float) -> Problem:
     """The problem in a loop whose periods are a share of a stage.
 
     Controls may change by as much of what they may change from stage to stage: else they could in every period by all
-    of it. The bounds have a row per knot.
+    of it. The bounds have a row per knot. Those of a loop of other periods, which have it, are these from here on.
     """
     rows: list[Any] = list(problem.constraints)
     for i, part in enumerate(rows):
-        if follows(part) and part.holds_at(0):
+        if follows(part) and part.holds_at(0) and part.share != share:
             knots = torch.arange(problem.N, device=problem.x0.device)[part.knots]
             shares = torch.where(knots == 0, share / part.share, 1.0).to(problem.x0).unsqueeze(-1)
             lower, upper = (bound * shares for bound in part.by_knot)

@@ -14,7 +14,7 @@ from torchgco.base.errors import InputError, shown
 from torchgco.base.options import Seconds, check_value
 from torchgco.compiled import Compiled, compile
 from torchgco.compiled.motion import Motion
-from torchgco.compiled.stages import check_loop_in_free_time, in_periods, previous_of, stage_of
+from torchgco.compiled.stages import check_loop_in_free_time, follows, in_periods, previous_of, stage_of
 from torchgco.constraints.gates import has_gates
 from torchgco.constraints.link import Integral
 from torchgco.export.beginning import beginning
@@ -114,8 +114,8 @@ def _compiled(problem: Problem | Compiled, period: float | None) -> Compiled:
     """The problem as it is now, for the interior point and steps of this period."""
     again = isinstance(problem, Compiled)
     asked = _checked(problem.now if again else problem)
-    if period is not None and asked.time is None and (share := period / stage_of(asked)) < 1.0:
-        asked = in_periods(asked, share)
+    if asked.time is None and any(map(follows, asked.constraints)):
+        asked = in_periods(asked, 1.0 if period is None else min(1.0, period / stage_of(asked)))
     with served_by(*problem.origin) if again else nullcontext():
         return compile(asked, "interior_point", tolerance=problem.interior.tolerance if again else None)
 
