@@ -16,6 +16,7 @@ from tests.search.gates import LOCAL
 from torchgco import (
     Boxes,
     ControlBounds,
+    FunctionCost,
     FunctionDynamics,
     Goal,
     InteriorPoint,
@@ -199,3 +200,12 @@ def test_where_nothing_else_is_sound_a_vehicle_comes_to_rest() -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_where_nothing_else_is_sound_vehicles_come_to_rest(seed: int) -> None:
     settled_in_turned_boxes(64, seed)
+
+
+def test_a_guess_that_costs_less_by_rounding_does_not_replace_what_converged() -> None:
+    """Resting is the least cost there is, 0: it was FEASIBLE beside a solved trajectory of cost 1e-18."""
+    model = FunctionDynamics(lambda x, u: torch.cat((x[..., 1:], u), -1), 2, 1, 0.1)
+    cost = FunctionCost(lambda x, u: 0.12 * u[..., 0])
+    x0 = torch.tensor([[0.5, 0.03], [-0.9, 0.0]]).double()
+    found = solve(Problem(model, cost, [ControlBounds(0.0, 1.4), StateBounds(-4.0, 4.0)], x0, N=80), verbose=False)
+    assert found.statuses == [Status.CONVERGED] * 2 and float(found.cost.abs().max()) < 1e-12

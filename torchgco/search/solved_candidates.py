@@ -24,6 +24,7 @@ from torchgco.search.finish import WORTH, ClearChords, Converge, clear_further, 
 from torchgco.search.following import Paths
 from torchgco.search.proposals import Part
 from torchgco.search.search import Search, is_sound
+from torchgco.solvers.ending import STATIONARY
 from torchgco.solvers.interior import InteriorPoint
 
 LAST_DEPTH = 0.8  # depth in an obstacle, in R, of candidates that come after all others
@@ -194,7 +195,9 @@ def _better_guesses(search: Search) -> tuple[Tensor, Iterate]:
     """
     call, end, limit = search.call, search.best.end, search.solver.violation_tolerance
     problem, best, guess, sound = call.problem, end.best, search.guess, search.best.sound
-    cheaper = guess.cost < best.cost - _worth(search, guess.violation, best.violation) * best.cost.abs()
+    # A stationary trajectory may leave something to save.
+    tight = torch.where(end.status == Status.CONVERGED, STATIONARY, search.interior.tolerance)
+    cheaper = guess.cost < best.cost - _worth(search, problem, tight, best.cost, guess.violation, best.violation)
     better = ~sound | (~_falls_short(problem, guess.X, best.X) & (cheaper | _falls_short(problem, best.X, guess.X)))
     better &= (guess.violation <= limit) & torch.isfinite(guess.cost) & (end.status != Status.INVALID_START)
     rows = better.nonzero().flatten()
@@ -234,10 +237,16 @@ def _falls_short(problem: Problem, X: Tensor, other: Tensor) -> Tensor:
     return leaves_goal(problem, X, other) | (outside_goal(problem, X) & ~outside_goal(problem, other))
 
 
-def _worth(search: Search, violation: Tensor, other: Tensor) -> Tensor:
-    """The share (B,) of the cost by which a trajectory has to be cheaper than another one, by their violations."""
-    loose = violation > other.clamp(min=search.interior.admitted(search.call.problem))
-    return torch.where(loose, WORTH, search.interior.tolerance)
+def _worth(
+    search: Search, problem: Problem, tight: Tensor | float, cost: Tensor, violation: Tensor, other: Tensor
+) -> Tensor:
+    """By how much (B,) a trajectory has to be cheaper than another one of this cost, by their violations.
+
+    Args:
+        tight: the share of the cost where it violates by no more.
+    """
+    loose, scale = violation > other.clamp(min=search.interior.admitted(search.call.problem)), problem.cost_scale
+    return torch.where(loose, WORTH, tight) * ((cost - scale.constant).abs() + scale.size)
 
 
 def _go_on(search: Search, rows: Tensor, guess: Iterate) -> None:
@@ -246,7 +255,8 @@ def _go_on(search: Search, rows: Tensor, guess: Iterate) -> None:
     solver = replace(search.interior, initial_barrier=SOLVER.initial_barrier)
     end = solved_nearby(solver, call, guess.X)
     clear_further(search, call, end)
-    new, share = end.best, _worth(search, guess.violation, end.best.violation)
+    new = end.best
+    more = _worth(search, call.problem, search.interior.tolerance, guess.cost, guess.violation, new.violation)
     serves = is_sound(call.problem, new, search.solver.violation_tolerance) & torch.isfinite(new.cost)
-    serves &= ~_falls_short(call.problem, new.X, guess.X) & (new.cost <= guess.cost + share * guess.cost.abs())
+    serves &= ~_falls_short(call.problem, new.X, guess.X) & (new.cost <= guess.cost + more)
     search.best.replace(rows, serves, new, end)
