@@ -11,7 +11,7 @@ search takes. Its results compete with the search's by cost, at the end; they sp
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -271,7 +271,6 @@ def _driven(problem: Problem, U: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]
 FROM_CAUGHT = 1e-2  # barrier for iterates that lie inside of obstacles by little
 
 
-@lru_cache(maxsize=64)
 @dataclass(frozen=True)
 class Direct(Row):
     """Solves caught problems by the interior point too; the results are compared with the search's at its end.
