@@ -128,3 +128,13 @@ def test_where_bodies_bar_all_ways_by_what_they_may_do_those_they_bar_now_count(
     now = replace(balls, growth=0.0)
     way = around(balls, far)
     assert way is not LINE and balls.gaps(LINE, t).min() < 0.0 and now.gaps(way, t).min() > KEEP - 0.15
+
+
+def test_a_way_keeps_away_from_bodies_as_wide_as_they_will_be() -> None:
+    """The farther ahead, the wider: the lattice has each of them at its time."""
+    body = Moving.balls(np.array([[8.0, 0.0, 2.0]]), np.zeros((1, 3)), np.array([0.4]))
+    t, grown = DT * np.arange(len(LINE)), replace(body, growth=0.3)
+    for bodies in (body, grown):
+        way = around(bodies, far)
+        assert bodies.gaps(way, t).min() > KEEP - 0.05
+    assert grown.gaps(around(body, far), t).min() < KEEP - 0.1

@@ -17,15 +17,17 @@ def ball(center: list[float], radius: float) -> np.ndarray:
     return np.concatenate([center, np.eye(3).ravel(), np.zeros(3), [radius]])
 
 
-def watched(velocity: list[float], steps: int, wall: bool = True) -> tuple[Tracks, World, SeenMap, float]:
-    """What a lidar at rest has followed: a sphere in free space beside a wall."""
+def watched(
+    velocity: list[float], steps: int, wall: bool = True, before: int = 8
+) -> tuple[Tracks, World, SeenMap, float]:
+    """What a lidar at rest has followed: a sphere in free space beside a wall, which it sees alone `before`."""
     boxes = [ball([5.0, -2.0, 0.0], 0.5)]
     if wall:
         boxes.append(np.concatenate([[8.0, 0.0, 0.0], np.eye(3).ravel(), [0.2, 6.0, 2.0], [0.0]]))
     world = World(np.array(boxes), Motion.steady(np.array([velocity, [0.0, 0.0, 0.0]])[: len(boxes)]))
     lidar, seen = Lidar(noise=0.01), SeenMap(np.array([-1.0, -6.0, -2.0]), (60, 60, 20), 0.2)
     tracks, without = Tracks(lidar.pitch), World(world.boxes[1:], world.motion.take(np.arange(1, len(boxes))))
-    for step in range(-8, steps):  # at first without the sphere
+    for step in range(-before, steps):
         now = world.at(0.1 * step) if step >= 0 else without
         scan = lidar.scan(now, [0.0, 0.0, 0.0], [1, 0, 0, 0], 0.0, (0, 0, step + 8))
         keep = tracks.observe(scan, seen, 0.1 * step)
@@ -43,6 +45,16 @@ def test_a_sphere_that_passes_is_followed() -> None:
     assert len(centers) > 100 and (np.abs(centers[:, 0] - 7.9) < 0.3).all()  # the wall alone
     gone = tracks.now(t + 0.5)
     assert np.linalg.norm(gone.centers[0] - world.at(t + 0.5).boxes[0, :3]) < 0.3
+
+
+def test_a_sphere_that_moves_from_the_first_scan_on_is_followed_too() -> None:
+    """Its first returns lie in cells that never were free: they aren't those of a surface yet."""
+    tracks, world, _, t = watched([0.0, 2.0, 0.3], 12, wall=False, before=0)
+    now, place = tracks.now(t), world.at(t).boxes[0, :3]
+    assert len(now.radii) > 0 and now.gaps(place[None], np.zeros(1))[0] < 0.0
+    for track in tracks.tracks:  # one of them, or one of each part that the first scan saw apart
+        assert np.linalg.norm(track.center - place) < 0.5
+        assert np.linalg.norm(track.velocity - [0.0, 2.0, 0.3]) < 0.2
 
 
 def test_what_stays_where_it_appears_goes_into_the_map() -> None:

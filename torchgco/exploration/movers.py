@@ -131,7 +131,7 @@ class Moving:
         return planes
 
     def clear_of(self, point: np.ndarray, least: float) -> Self:
-        """Estimated balls that are smaller where the vehicle at a point (3,) would be nearer than `least`, m, now.
+        """Estimated bodies that are smaller where the vehicle at a point (3,) would be nearer than `least`, m, now.
 
         It hasn't touched them, so their sizes are wrong by that much; what is known stays as it is.
         """

@@ -69,7 +69,6 @@ def _inner(tolerance: float, iterations: int) -> ILQR:
     return ILQR(tolerance=tolerance, max_iterations=iterations, line_search=LINE_SEARCH)
 
 
-@lru_cache(maxsize=64)
 def unwatched(done: int, total: int) -> None:
     """Ignores the progress of candidates."""
 

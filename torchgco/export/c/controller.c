@@ -466,7 +466,8 @@ static void hold(const NAME_workspace *w, const Solve *b, const double *x, doubl
     for (int j = 0; j < NU; j++) {
         u[j] = b->rest[j];
         if (w->age < 0) continue;
-        u[j] = several ? means[j] : share > 0 ? w->U[later * NU + j] * share + (1 - share) * w->U[k * NU + j] : w->U[k * NU + j];
+        u[j] = several ? means[j] : w->U[k * NU + j];
+        if (!several && share > 0) u[j] = w->U[later * NU + j] * share + (1 - share) * u[j];
         for (int i = 0; x && !RATED && i < USER_NX; i++) {
             double K = w->K[(k * NU + j) * USER_NX + i], X = w->X[knot * USER_NX + i];
             if (share > 0) {
